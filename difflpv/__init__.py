@@ -1,0 +1,3 @@
+"""Differentiable light propagation volumes: inverse lighting in PyTorch with NVIDIA Warp kernels."""
+
+__version__ = "0.1.0"
