@@ -75,11 +75,15 @@ class Grid:
         return int(np.prod(self.resolution))
 
     def with_cells(self, cells: int) -> Grid:
-        """The same box with ``cells`` cells along its first axis."""
-        edge = self.cell_size * self.resolution[0]
-        size = edge / cells
-        counts = [int(round(n * self.cell_size / size)) for n in self.resolution]
-        return Grid.from_bounds(self.minimum, self.maximum, counts)
+        """The same box with ``cells`` cells along its first axis.
+
+        Where a cell's edge does not divide the other edges, the box grows at their high end by less than a cell.
+        """
+        if cells < 1:
+            raise ValueError(f"grid cells: expected at least 1, got {cells}")
+        size = self.cell_size * self.resolution[0] / cells
+        nx, ny, nz = (int(np.ceil(n * self.cell_size / size - 1e-6)) for n in self.resolution)
+        return Grid(self.minimum, size, (nx, ny, nz))
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """True where a point [n,3] [m] lies in a cell, shape [n]."""

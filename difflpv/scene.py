@@ -101,6 +101,32 @@ class Mesh:
             raise SceneError(f"mesh '{self.name}': uv must have shape [V, 2], got {list(self.uv.shape)}")
 
 
+def _vector(light: object, name: str) -> np.ndarray:
+    """Field ``name`` of a light as float64 [3], finite."""
+    value = np.asarray(getattr(light, name), np.float64)
+    label = getattr(light, "name", getattr(light, "mesh", ""))
+    if value.shape != (3,) or not np.isfinite(value).all():
+        raise SceneError(f"light '{label}': {name} must be three finite numbers, got {value.tolist()}")
+    return value
+
+
+def _check_light(light: object, power: str, position: bool = False, direction: bool = False) -> None:
+    """Normalise a light's fields in place: float64 vectors, power >= 0, unit direction."""
+    value = _vector(light, power)
+    label = getattr(light, "name", getattr(light, "mesh", ""))
+    if (value < 0).any():
+        raise SceneError(f"light '{label}': {power} must be >= 0, got {value.tolist()}")
+    object.__setattr__(light, power, value)
+    if position:
+        object.__setattr__(light, "position", _vector(light, "position"))
+    if direction:
+        vector = _vector(light, "direction")
+        length = float(np.linalg.norm(vector))
+        if not length > 0:
+            raise SceneError(f"light '{label}': direction has no length")
+        object.__setattr__(light, "direction", vector / length)
+
+
 @dataclass(frozen=True, eq=False)
 class AreaLight:
     """The triangles of mesh ``mesh`` (its name) emit ``radiance`` [3] W/(m2 sr), constant over surface and angle."""
@@ -108,6 +134,9 @@ class AreaLight:
     mesh: str
     radiance: np.ndarray
     two_sided: bool = False
+
+    def __post_init__(self) -> None:
+        _check_light(self, "radiance")
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,6 +146,9 @@ class PointLight:
     position: np.ndarray
     intensity: np.ndarray
     name: str = "point"
+
+    def __post_init__(self) -> None:
+        _check_light(self, "intensity", position=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +161,14 @@ class SpotLight:
     inner_angle: float = 0.0
     outer_angle: float = float(np.pi / 4)
     name: str = "spot"
+
+    def __post_init__(self) -> None:
+        _check_light(self, "intensity", position=True, direction=True)
+        if not 0 <= self.inner_angle < self.outer_angle <= np.pi / 2 + 1e-6:
+            raise SceneError(
+                f"light '{self.name}': angles must satisfy 0 <= inner < outer <= pi/2, "
+                f"got inner {self.inner_angle}, outer {self.outer_angle}"
+            )
 
     def falloff(self, cos_angle: np.ndarray) -> np.ndarray:
         """Angular attenuation of KHR_lights_punctual: clamp((cos - cos_outer)/(cos_inner - cos_outer))^2."""
@@ -143,6 +183,9 @@ class DirectionalLight:
     direction: np.ndarray
     irradiance: np.ndarray
     name: str = "directional"
+
+    def __post_init__(self) -> None:
+        _check_light(self, "irradiance", direction=True)
 
 
 Light = AreaLight | PointLight | SpotLight | DirectionalLight
@@ -216,8 +259,16 @@ class Scene:
 
     @cached_property
     def triangle_normals(self) -> np.ndarray:
-        """Unit geometric normals, shape [T,3]."""
-        return self.triangle_cross / np.linalg.norm(self.triangle_cross, axis=1, keepdims=True)
+        """Unit geometric normals, shape [T,3].
+
+        Raises:
+            SceneError: a triangle has no area (the loaders drop such triangles).
+        """
+        length = np.linalg.norm(self.triangle_cross, axis=1, keepdims=True)
+        if not length.all():
+            mesh = self.meshes[self.triangle_mesh[int(np.argmin(length))]].name
+            raise SceneError(f"scene '{self.name}': mesh '{mesh}' has a triangle without area")
+        return self.triangle_cross / length
 
     @cached_property
     def triangle_areas(self) -> np.ndarray:
@@ -278,6 +329,9 @@ class Scene:
     def with_lights(self, lights: Sequence[Light], moved: dict[str, Mesh] | None = None) -> Scene:
         """The same scene under other lights; ``moved`` replaces meshes by name (an area light's panel)."""
         moved = moved or {}
+        unknown = set(moved) - {m.name for m in self.meshes}
+        if unknown:
+            raise SceneError(f"scene '{self.name}': no mesh '{min(unknown)}', meshes are {[m.name for m in self.meshes]}")
         meshes = tuple(moved.get(m.name, m) for m in self.meshes)
         return replace(self, meshes=meshes, lights=tuple(lights))
 
