@@ -1,0 +1,151 @@
+"""Speed of propagation as ratios measured in one run: a step against conv3d, the adjoint against the forward.
+
+    python benchmarks/propagation.py [--cells 32 64] [--steps 32] [--repeats 9] [--json OUT]
+
+Peers: torch's conv3d (channels_last_3d) with the equivalent linear weights; torch autograd through it; the best vectorised
+torch formulation of clamp and occlusion (a matrix product to all face fluxes, clamp, occlusion, shifted adds), eager.
+Configurations alternate so that the machine's drift hits all alike; medians are printed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import time
+from collections.abc import Callable
+
+import torch
+
+from difflpv.propagation import propagate
+from difflpv.stencil import FaceStencil, holpv_stencil, lpv_stencil
+
+
+def interleaved(calls: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
+    """Median seconds of each call, taken in turns after one warm-up."""
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for call in calls.values():
+        call()
+    for _ in range(repeats):
+        for name, call in calls.items():
+            start = time.perf_counter()
+            call()
+            times[name].append(time.perf_counter() - start)
+    return {name: statistics.median(values) for name, values in times.items()}
+
+
+def torch_faces(volume: torch.Tensor, stencil: FaceStencil, factors: torch.Tensor, passed: torch.Tensor) -> torch.Tensor:
+    """Vectorised torch: fluxes of all faces by one product, clamp, occlusion; per lobe axis shifted sums, one product back."""
+    weights = torch.tensor(stencil.flux_weights, dtype=volume.dtype)
+    axes = torch.tensor(stencil.lobe_axes)
+    names = torch.unique(axes, dim=0)
+    owner = [int((names == a).all(1).nonzero()) for a in axes]
+    lobes = torch.stack([torch.tensor(stencil.lobes[owner.index(i)], dtype=volume.dtype) for i in range(len(names))])
+    moving = total = volume
+    size = volume.shape[2:]
+    for factor in factors:
+        flux = torch.relu(torch.einsum("fk,ckzyx->cfzyx", weights, moving)) * passed
+        padded = torch.nn.functional.pad(flux, (1,) * 6)
+        parts: list[list[torch.Tensor]] = [[] for _ in names]
+        for f, (x, y, z) in enumerate(stencil.offsets.tolist()):
+            window = padded[:, f, 1 - z : 1 - z + size[0], 1 - y : 1 - y + size[1], 1 - x : 1 - x + size[2]]
+            parts[owner[f]].append(window)
+        arrived = torch.stack([sum(p[1:], start=p[0]) for p in parts], 1)
+        moving = factor * torch.einsum("ak,cazyx->ckzyx", lobes, arrived)
+        total = total + moving
+    return total
+
+
+def torch_convolution(volume: torch.Tensor, weight: torch.Tensor, factors: torch.Tensor) -> torch.Tensor:
+    """Autograd through conv3d, channels_last_3d."""
+    moving = total = volume.contiguous(memory_format=torch.channels_last_3d)
+    for factor in factors:
+        moving = factor * torch.nn.functional.conv3d(moving, weight, padding=1)
+        total = total + moving
+    return total
+
+
+def measure(stencil: FaceStencil, cells: int, steps: int, repeats: int) -> dict[str, float]:
+    """All ratios of one stencil at one size."""
+    generator = torch.Generator().manual_seed(0)
+    coeffs = (stencil.l_max + 1) ** 2
+    volume = torch.randn(3, coeffs, cells, cells, cells, generator=generator)
+    volume[:, 0] = volume[:, 0].abs() * 3
+    passed = torch.rand(len(stencil.offsets), cells, cells, cells, generator=generator)
+    linear = stencil.linear()
+    weight = torch.zeros(coeffs, coeffs, 3, 3, 3)
+    for n, matrix in zip(linear.offsets.tolist(), linear.matrices, strict=True):
+        weight[:, :, 1 - n[2], 1 - n[1], 1 - n[0]] = torch.tensor(matrix, dtype=torch.float32)
+    weight = weight.contiguous(memory_format=torch.channels_last_3d)
+    factors = torch.full((steps,), 0.97)
+
+    def forward(**options: object) -> Callable[[], object]:
+        def call() -> object:
+            with torch.no_grad():
+                return propagate(volume, stencil, steps=steps, factor=factors, **options)  # type: ignore[arg-type]
+
+        return call
+
+    def both(solve: Callable[[torch.Tensor, torch.Tensor], torch.Tensor]) -> Callable[[], object]:
+        def call() -> object:
+            light, learned = volume.clone().requires_grad_(), factors.clone().requires_grad_()
+            return torch.autograd.grad(solve(light, learned).sum(), (light, learned))
+
+        return call
+
+    def ours(**options: object) -> Callable[[], object]:
+        return both(lambda v, p: propagate(v, stencil, steps=steps, factor=p, **options))  # type: ignore[arg-type]
+
+    def conv_forward() -> object:
+        with torch.no_grad():
+            return torch_convolution(volume, weight, factors)
+
+    calls: dict[str, Callable[[], object]] = {
+        "conv3d forward": conv_forward,
+        "conv3d autograd": both(lambda v, p: torch_convolution(v, weight, p)),
+        "linear forward": forward(clamp=False),
+        "linear both": ours(clamp=False),
+        "clamp forward": forward(),
+        "clamp both": ours(),
+        "clamp+occlusion forward": forward(transmittance=passed),
+        "clamp+occlusion both": ours(transmittance=passed),
+        "torch faces forward": lambda: torch_faces(volume, stencil, factors, passed),
+        "torch faces both": both(lambda v, p: torch_faces(v, stencil, p, passed)),
+    }
+    t = interleaved(calls, repeats)
+    occluded = t["clamp+occlusion forward"]
+    return {
+        **{f"{name} [ms]": 1e3 * seconds for name, seconds in t.items()},
+        "step, clamp and occlusion / conv3d": occluded / t["conv3d forward"],
+        "forward+backward / forward, linear": t["linear both"] / t["linear forward"],
+        "forward+backward / forward, clamp": t["clamp both"] / t["clamp forward"],
+        "forward+backward / forward, clamp and occlusion": t["clamp+occlusion both"] / occluded,
+        "autograd through conv3d / ours, linear": t["conv3d autograd"] / t["linear both"],
+        "autograd through conv3d / ours, clamp": t["conv3d autograd"] / t["clamp both"],
+        "torch faces / ours, occlusion, forward": t["torch faces forward"] / occluded,
+        "torch faces / ours, occlusion, forward+backward": t["torch faces both"] / t["clamp+occlusion both"],
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cells", type=int, nargs="+", default=[32, 64])
+    parser.add_argument("--steps", type=int, default=32)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--json")
+    arguments = parser.parse_args()
+    results = {}
+    for cells in arguments.cells:
+        for stencil in (lpv_stencil(), holpv_stencil()):
+            row = measure(stencil, cells, arguments.steps, arguments.repeats)
+            results[f"{stencil.name} {cells}"] = row
+            print(f"{stencil.name} {cells}^3, {arguments.steps} steps, {torch.get_num_threads()} threads")
+            for name, value in row.items():
+                print(f"  {name:52s} {value:9.2f}", flush=True)
+    if arguments.json:
+        with open(arguments.json, "w") as file:
+            json.dump(results, file, indent=1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,311 @@
+"""Face stencils on the Warp kernels: padded buffers, slabs on two threads, checkpoints, and the adjoint sweep.
+
+Adjoint of A = sum_i S_i with S_{i+1} = F_i(S_i): G_N = Abar, G_i = Abar + (dF_i/dS)^T G_{i+1}, and the volume's gradient
+is G_0. Volumes are kept only where the clamp or a learnable of the propagation needs them.
+"""
+
+from __future__ import annotations
+
+import math
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+from difflpv.bridge import as_warp, launch, refuse_second_derivative, warp_scalar
+from difflpv.stencil import FaceStencil
+from warp_kernels.propagation import CPU_LANES, StepKernels, step_kernels
+
+__all__ = ["propagate_faces"]
+
+_KEEP_ALL_BYTES = 2**30
+
+
+@lru_cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="difflpv-slab")
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Padded fields of one volume shape; see ``warp_kernels.propagation``."""
+
+    channels: int
+    coeffs: int
+    z: int
+    y: int
+    x: int
+    lanes: int
+
+    @classmethod
+    def of(cls, volume: torch.Tensor) -> _Layout:
+        channels, coeffs, z, y, x = volume.shape
+        return cls(channels, coeffs, z, y, x, 1 if volume.is_cuda else CPU_LANES)
+
+    @property
+    def row(self) -> int:
+        return -(-self.x // self.lanes) * self.lanes + 2
+
+    @property
+    def cells(self) -> int:
+        return (self.z + 2) * (self.y + 2) * self.row
+
+    @property
+    def group(self) -> int:
+        """Channels that one thread works on together."""
+        return 3 if self.channels % 3 == 0 else 1
+
+    @property
+    def rows(self) -> int:
+        return self.channels // self.group * self.z * self.y
+
+    def length(self, fields: int) -> int:
+        return fields * self.cells + self.lanes
+
+    def empty(self, fields: int, like: torch.Tensor) -> torch.Tensor:
+        """Zeroed flat buffer of so many padded scalar fields."""
+        return torch.zeros(self.length(fields), dtype=like.dtype, device=like.device)
+
+    def inside(self, buffer: torch.Tensor, fields: int) -> torch.Tensor:
+        """View of the cells without halo, shape [fields, n_z, n_y, n_x]."""
+        view = buffer[: fields * self.cells].view(fields, self.z + 2, self.y + 2, self.row)
+        return view[:, 1:-1, 1:-1, 1 : self.x + 1]
+
+    def pad(self, field: torch.Tensor, into: torch.Tensor | None = None) -> torch.Tensor:
+        """Flat padded copy of a field [..., n_z, n_y, n_x]."""
+        field = field.detach().reshape(-1, self.z, self.y, self.x)
+        buffer = self.empty(len(field), field) if into is None else into
+        self.inside(buffer, len(field)).copy_(field)
+        return buffer
+
+
+class _Steps:
+    """Launches of one solve: constant arguments bound once, the moving buffers given per step."""
+
+    def __init__(
+        self, layout: _Layout, factors: torch.Tensor, transmittance: torch.Tensor, offsets: torch.Tensor,
+        axis: torch.Tensor, weights: torch.Tensor, lobes: torch.Tensor, clamp: bool, occlude_first_step: bool,
+    ) -> None:  # fmt: skip
+        self.layout, self.lobes, self.device = layout, lobes.detach(), factors.device
+        self.clamp, self.occlude_first_step = clamp, occlude_first_step
+        self.kernels: StepKernels = step_kernels(
+            warp_scalar(factors.dtype), coeffs=layout.coeffs, axes=len(lobes), channels=layout.group, lanes=layout.lanes
+        )
+        self.occluded = len(transmittance) > 0
+        n = offsets.cpu().numpy()
+        flat = (n[:, 2] * (layout.y + 2) + n[:, 1]) * layout.row + n[:, 0]
+        shifts, neighbour = np.unique(flat, return_inverse=True)
+        first = np.concatenate([[0], np.cumsum(np.bincount(neighbour.ravel()))])
+        self.pairs, self.neighbours = len(n) // 2, len(shifts)
+        topology = {"shift": shifts, "first": first, "face": np.argsort(neighbour.ravel(), kind="stable"), "face_shift": flat}
+        self._tensors = {k: torch.tensor(v, dtype=torch.int32, device=self.device) for k, v in topology.items()}
+        self._tensors |= {"axis": axis.to(torch.int32), "weights": weights, "lobes": lobes, "factor": factors}
+        self._tensors["transmittance"] = layout.pad(transmittance) if self.occluded else transmittance
+        self._tensors = {k: v.detach().contiguous().reshape(-1) for k, v in self._tensors.items()}
+        self._views = {k: as_warp(v) for k, v in self._tensors.items()}
+
+    def occlude(self, step: int) -> bool:
+        """True where the transmittance acts on this step."""
+        return self.occluded and (step > 0 or self.occlude_first_step)
+
+    def forward(self, moving: torch.Tensor, into: torch.Tensor, total: torch.Tensor, step: int) -> None:
+        """S_{step+1} from S_step, added onto ``total``; all flat padded buffers."""
+        v, layout = self._views, self.layout
+        arguments = [
+            as_warp(moving), as_warp(into), as_warp(total), v["transmittance"], v["weights"], v["lobes"], v["factor"],
+            v["shift"], v["first"], v["face"], v["axis"], self.neighbours, int(self.clamp), int(self.occlude(step)), step,
+            layout.cells, layout.y + 2, layout.row, layout.z, layout.y, layout.x,
+        ]  # fmt: skip
+        self._launch(self.kernels.forward, arguments)
+
+    def adjoint(
+        self, moving: torch.Tensor | None, after: torch.Tensor, lobe_bar: torch.Tensor, total_bar: torch.Tensor,
+        into: torch.Tensor, transmittance_bar: torch.Tensor, factor_bar: torch.Tensor, step: int,
+    ) -> None:  # fmt: skip
+        """G_step from G_{step+1} (``after``); adds onto ``transmittance_bar`` (unless empty) and ``factor_bar``."""
+        v, layout = self._views, self.layout
+        states = after[: layout.channels * layout.coeffs * layout.cells].view(layout.channels, layout.coeffs, -1)
+        products = lobe_bar[: layout.channels * len(self.lobes) * layout.cells].view(layout.channels, len(self.lobes), -1)
+        torch.matmul(self.lobes, states, out=products)
+        arguments = [
+            as_warp(after if moving is None else moving), as_warp(lobe_bar), as_warp(total_bar), as_warp(into),
+            v["transmittance"], as_warp(transmittance_bar), as_warp(factor_bar), v["weights"], v["factor"], v["face_shift"],
+            v["axis"], self.pairs, int(self.clamp), int(self.occlude(step)), int(moving is not None),
+            int(len(transmittance_bar) > 0 and self.occlude(step)), step, layout.cells, layout.y + 2, layout.row,
+            layout.channels // layout.group, layout.z, layout.y, layout.x,
+        ]  # fmt: skip
+        self._launch(self.kernels.adjoint, arguments)
+
+    def _launch(self, kernel: Any, arguments: list[Any]) -> None:
+        rows = self.layout.rows
+        if self.device.type == "cuda":
+            launch(kernel, (rows, self.layout.x), [*arguments, 0], self.device)
+            return
+        kernel.module.load("cpu")  # once, before threads race for it
+        threads = max(1, min(torch.get_num_threads(), rows))
+        bounds = [rows * i // threads for i in range(threads + 1)]
+
+        def slab(i: int) -> None:
+            launch(kernel, (bounds[i + 1] - bounds[i], 1), [*arguments, bounds[i]], self.device)
+
+        waiting = [_pool(threads).submit(slab, i) for i in range(1, threads)]
+        slab(0)
+        for future in waiting:
+            future.result()
+
+
+def _slots(steps: int, keep: int) -> int:
+    return -(-steps // keep) if keep else 0
+
+
+@torch.library.custom_op("difflpv::propagate_faces", mutates_args=())
+def _propagate(
+    volume: torch.Tensor, factors: torch.Tensor, transmittance: torch.Tensor, offsets: torch.Tensor, axis: torch.Tensor,
+    weights: torch.Tensor, lobes: torch.Tensor, clamp: bool, occlude_first_step: bool, tolerance: float, keep: int,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
+    layout = _Layout.of(volume)
+    fields = layout.channels * layout.coeffs
+    steps = _Steps(layout, factors, transmittance, offsets, axis, weights, lobes, clamp, occlude_first_step)
+    count = len(factors)
+    states = volume.new_zeros((_slots(count, keep), layout.length(fields)))
+    moving, spare = layout.pad(volume), layout.empty(fields, volume)
+    total = moving.clone()
+
+    def flux(buffer: torch.Tensor) -> float:
+        return float(layout.inside(buffer, fields)[:: layout.coeffs].abs().sum())
+
+    injected = flux(moving) if tolerance else 0.0
+    done = count
+    for step in range(count):
+        if tolerance and flux(moving) <= tolerance * injected:
+            done = step
+            break
+        if keep and step % keep == 0:
+            states[step // keep].copy_(moving)
+        steps.forward(moving, spare, total, step)
+        moving, spare = spare, moving
+    accumulated = layout.inside(total, fields).reshape(volume.shape).contiguous()
+    return accumulated, states, torch.tensor(done)
+
+
+@_propagate.register_fake
+def _(volume, factors, transmittance, offsets, axis, weights, lobes, clamp, occlude_first_step, tolerance, keep):  # type: ignore[no-untyped-def]
+    layout = _Layout.of(volume)
+    states = volume.new_empty((_slots(len(factors), keep), layout.length(layout.channels * layout.coeffs)))
+    return torch.empty_like(volume, memory_format=torch.contiguous_format), states, torch.empty((), dtype=torch.int64)
+
+
+@torch.library.custom_op("difflpv::propagate_faces_backward", mutates_args=())
+def _propagate_backward(
+    accumulated_bar: torch.Tensor, states: torch.Tensor, done: torch.Tensor, factors: torch.Tensor,
+    transmittance: torch.Tensor, offsets: torch.Tensor, axis: torch.Tensor, weights: torch.Tensor, lobes: torch.Tensor,
+    clamp: bool, occlude_first_step: bool, keep: int, need_transmittance: bool,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
+    layout = _Layout.of(accumulated_bar)
+    fields = layout.channels * layout.coeffs
+    steps = _Steps(layout, factors, transmittance, offsets, axis, weights, lobes, clamp, occlude_first_step)
+    total_bar = layout.pad(accumulated_bar)
+    after, spare = total_bar.clone(), layout.empty(fields, accumulated_bar)
+    lobe_bar = layout.empty(layout.channels * len(lobes), accumulated_bar)
+    factor_bar = accumulated_bar.new_zeros(len(factors) * layout.rows)
+    faces = len(transmittance) if need_transmittance else 0
+    transmittance_bar = layout.empty(faces, accumulated_bar) if faces else accumulated_bar.new_empty(0)
+    segment = [layout.empty(fields, accumulated_bar) for _ in range(min(keep, len(factors)) - 1)] if keep else []
+    unused = layout.empty(fields, accumulated_bar) if segment else spare
+    count = int(done)
+    for begin in reversed(range(0, count, keep or max(count, 1))):
+        end = min(begin + keep, count) if keep else count
+        volumes: list[torch.Tensor | None] = [None] * (end - begin)
+        if keep:
+            volumes = [states[begin // keep], *segment[: end - begin - 1]]
+            for i in range(end - begin - 1):
+                steps.forward(volumes[i], volumes[i + 1], unused, begin + i)  # type: ignore[arg-type]
+        for step in reversed(range(begin, end)):
+            steps.adjoint(
+                volumes[step - begin], after, lobe_bar, total_bar, spare, transmittance_bar, factor_bar, step
+            )
+            after, spare = spare, after
+    volume_bar = layout.inside(after, fields).reshape(accumulated_bar.shape).contiguous()
+    if faces:
+        transmittance_bar = layout.inside(transmittance_bar, faces).contiguous()
+    return volume_bar, factor_bar.view(len(factors), layout.rows).sum(1), transmittance_bar
+
+
+@_propagate_backward.register_fake
+def _(  # type: ignore[no-untyped-def]
+    accumulated_bar, states, done, factors, transmittance, offsets, axis, weights, lobes, clamp, occlude_first_step, keep,
+    need_transmittance,
+):  # fmt: skip
+    passed = torch.empty_like(transmittance) if need_transmittance else accumulated_bar.new_empty(0)
+    return torch.empty_like(accumulated_bar), torch.empty_like(factors), passed
+
+
+refuse_second_derivative("propagate", _propagate_backward)
+
+
+def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[torch.Tensor, ...]) -> None:
+    _, factors, transmittance, offsets, axis, weights, lobes, *flags = inputs
+    _, states, done = output
+    ctx.mark_non_differentiable(states, done)
+    ctx.save_for_backward(states, done, factors, transmittance, offsets, axis, weights, lobes)
+    ctx.clamp, ctx.occlude_first_step, _, ctx.keep = flags
+
+
+def _backward(ctx: Any, accumulated_bar: torch.Tensor, *unused: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+    need_volume, need_factors, need_transmittance = ctx.needs_input_grad[:3]
+    volume_bar, factor_bar, transmittance_bar = _propagate_backward(
+        accumulated_bar.contiguous(), *ctx.saved_tensors, ctx.clamp, ctx.occlude_first_step, ctx.keep, need_transmittance
+    )
+    return (
+        volume_bar if need_volume else None,
+        factor_bar if need_factors else None,
+        transmittance_bar if need_transmittance else None,
+        *[None] * 8,
+    )
+
+
+_propagate.register_autograd(_backward, setup_context=_setup)
+
+
+def propagate_faces(
+    volume: torch.Tensor,
+    stencil: FaceStencil,
+    factors: torch.Tensor,
+    transmittance: torch.Tensor | None,
+    *,
+    occlude_first_step: bool,
+    clamp: bool,
+    tolerance: float,
+    checkpoint_every: int | None,
+) -> torch.Tensor:
+    """``difflpv.propagation.propagate`` on the Warp kernels; arguments validated there, ``factors`` is [steps]."""
+    passed = volume.new_ones((0, *volume.shape[2:])) if transmittance is None else transmittance
+    learned = torch.is_grad_enabled() and (factors.requires_grad or passed.requires_grad)
+    needs = learned or (clamp and torch.is_grad_enabled() and volume.requires_grad)
+    keep = 0
+    if needs and len(factors):
+        bytes_a_step = _Layout.of(volume).length(volume.shape[0] * volume.shape[1]) * volume.element_size()
+        every = 1 if len(factors) * bytes_a_step <= _KEEP_ALL_BYTES else math.isqrt(len(factors))
+        keep = checkpoint_every or every
+    lobes, axis = np.unique(stencil.lobes, axis=0, return_inverse=True)
+
+    def tensor(values: np.ndarray) -> torch.Tensor:
+        return torch.as_tensor(values, dtype=volume.dtype, device=volume.device)
+
+    return _propagate(
+        volume.contiguous(),
+        factors.contiguous(),
+        passed.contiguous(),
+        torch.as_tensor(stencil.offsets, device=volume.device),
+        torch.as_tensor(axis.ravel(), device=volume.device),
+        tensor(stencil.flux_weights),
+        tensor(lobes),
+        clamp,
+        occlude_first_step,
+        float(tolerance),
+        keep,
+    )[0]

@@ -1,0 +1,129 @@
+"""Propagation of a volume through its grid: all steps in one differentiable op.
+
+``propagate`` picks what is fastest for the stencil and the device: a linear stencil without occlusion runs on torch's
+``conv3d`` with our adjoint (``difflpv.convolution``); the clamp, occlusion and CUDA run on the Warp kernels
+(``warp_kernels.propagation``) through ``difflpv.face_propagation``. Both agree with ``difflpv.reference.propagation``.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+
+from difflpv.bridge import check_float, refuse_forward_mode
+from difflpv.convolution import propagate_convolution
+from difflpv.face_propagation import propagate_faces
+from difflpv.sh import degree_of_count
+from difflpv.stencil import FaceStencil, LinearStencil
+
+__all__ = ["Backend", "propagate"]
+
+Backend = Literal["auto", "warp", "conv3d"]
+
+
+def propagate(
+    volume: torch.Tensor,
+    stencil: FaceStencil | LinearStencil,
+    *,
+    steps: int,
+    factor: float | torch.Tensor = 1.0,
+    transmittance: torch.Tensor | None = None,
+    occlude_first_step: bool = False,
+    clamp: bool | None = None,
+    matrices: torch.Tensor | None = None,
+    tolerance: float = 0.0,
+    checkpoint_every: int | None = None,
+    backend: Backend = "auto",
+) -> torch.Tensor:
+    """Move light through the grid for ``steps`` steps and add up what passes every cell.
+
+    Args:
+        volume: injected intensity [W/sr], shape [C, K, n_z, n_y, n_x], float32 or float64.
+        stencil: LPV, HOLPV or a linear stencil; K must be its coefficient count.
+        steps: number of steps, >= 0.
+        factor: propagation factor p, a number, a 0-d tensor or one per step [steps]. Learnable.
+        transmittance: share of each face's flux that passes, at the source cell, shape [F, n_z, n_y, n_x] (see
+            ``difflpv.occlusion.transmittance``). Learnable. Face stencils only.
+        occlude_first_step: the publications leave the first step unoccluded (self-shadowing); True occludes it too.
+        clamp: negative intensity carries no flux. Default True for face stencils; linear ones have none.
+        matrices: learnable replacement [n,K,K] for a linear stencil's matrices.
+        tolerance: stop once the moving flux is below this share of the injected flux (0: never). Reads one number back
+            per step, which on CUDA waits for the device.
+        checkpoint_every: keep every n-th volume for the backward pass and recompute between them. Default: every volume
+            up to 1 GiB, then about the square root of ``steps``. Nothing is kept where nothing needs it.
+        backend: "auto", or force the Warp kernels or ``conv3d``.
+
+    Returns:
+        Accumulated intensity [W/sr], shape of ``volume``: the sum of S_0 (the injected volume) to S_steps.
+
+    Raises:
+        TypeError, ValueError: naming the argument, what was expected and what came.
+
+    Source: Kaplanyan and Dachsbacher 2010, section 4.2; HOLPV thesis sections 3.2.3 and 4.2.
+    """
+    check_float("volume", volume)
+    if volume.ndim != 5:
+        raise ValueError(f"volume: expected shape [C, K, n_z, n_y, n_x], got {list(volume.shape)}")
+    if volume.shape[1] != (stencil.l_max + 1) ** 2:
+        raise ValueError(
+            f"volume: stencil '{stencil.name}' has {(stencil.l_max + 1) ** 2} coefficients, got {volume.shape[1]}"
+        )
+    degree_of_count(volume.shape[1])
+    if isinstance(steps, bool) or not isinstance(steps, int) or steps < 0:
+        raise ValueError(f"steps: expected an integer >= 0, got {steps!r}")
+    if checkpoint_every is not None and checkpoint_every < 1:
+        raise ValueError(f"checkpoint_every: expected at least 1, got {checkpoint_every}")
+    if not tolerance >= 0:
+        raise ValueError(f"tolerance: expected a number >= 0, got {tolerance}")
+    refuse_forward_mode("propagate", volume, transmittance, matrices, factor if isinstance(factor, torch.Tensor) else None)
+    factors = _factors(factor, steps, volume)
+    if isinstance(stencil, LinearStencil):
+        if transmittance is not None or clamp:
+            raise ValueError(f"stencil '{stencil.name}' is linear: it takes neither transmittance nor clamp")
+        if backend == "warp":
+            raise ValueError(f"backend: a linear stencil runs on conv3d, got {backend!r}")
+        return _linear(volume, stencil, matrices, factors, tolerance)
+    if matrices is not None:
+        raise ValueError(f"matrices: only a linear stencil takes them, got a face stencil '{stencil.name}'")
+    clamp = True if clamp is None else clamp
+    if transmittance is not None:
+        check_float("transmittance", transmittance, like=volume)
+        expected = (len(stencil.offsets), *volume.shape[2:])
+        if transmittance.shape != expected:
+            raise ValueError(f"transmittance: expected shape {list(expected)}, got {list(transmittance.shape)}")
+    plain = transmittance is None and not clamp
+    if backend == "conv3d" and not plain:
+        raise ValueError("backend: conv3d has neither clamp nor occlusion; use 'auto' or 'warp'")
+    if backend == "conv3d" or (backend == "auto" and plain and volume.device.type == "cpu"):
+        return _linear(volume, stencil.linear(), None, factors, tolerance)
+    return propagate_faces(
+        volume,
+        stencil,
+        factors,
+        transmittance,
+        occlude_first_step=occlude_first_step,
+        clamp=clamp,
+        tolerance=tolerance,
+        checkpoint_every=checkpoint_every,
+    )
+
+
+def _factors(factor: float | torch.Tensor, steps: int, volume: torch.Tensor) -> torch.Tensor:
+    if not isinstance(factor, torch.Tensor):
+        factor = torch.tensor(float(factor), dtype=volume.dtype, device=volume.device)
+    check_float("factor", factor, like=volume)
+    if factor.shape not in ((), (steps,)):
+        raise ValueError(f"factor: expected one number or one per step [{steps}], got shape {list(factor.shape)}")
+    return factor.expand(steps)
+
+
+def _linear(
+    volume: torch.Tensor, stencil: LinearStencil, matrices: torch.Tensor | None, factors: torch.Tensor, tolerance: float
+) -> torch.Tensor:
+    if matrices is None:
+        matrices = torch.as_tensor(stencil.matrices, dtype=volume.dtype, device=volume.device)
+    check_float("matrices", matrices, like=volume)
+    if matrices.shape != stencil.matrices.shape:
+        raise ValueError(f"matrices: expected shape {list(stencil.matrices.shape)}, got {list(matrices.shape)}")
+    return propagate_convolution(volume, stencil.offsets, matrices, factors, tolerance=tolerance)
