@@ -43,7 +43,7 @@ class Grid:
         count = np.broadcast_to(np.asarray(resolution, int), (3,))
         size = (high - low) / count
         if not (size > 0).all() or size.max() - size.min() > 1e-4 * size.max():
-            raise ValueError(f"grid bounds: expected cubic cells, got cells of {size.tolist()} m at {count.tolist()} cells")
+            raise ValueError(f"grid bounds: expected cubic cells, got {count.tolist()} cells of {size.tolist()} m")
         return cls(tuple(low.tolist()), float(size[0]), tuple(count.tolist()))
 
     @classmethod

@@ -331,7 +331,8 @@ class Scene:
         moved = moved or {}
         unknown = set(moved) - {m.name for m in self.meshes}
         if unknown:
-            raise SceneError(f"scene '{self.name}': no mesh '{min(unknown)}', meshes are {[m.name for m in self.meshes]}")
+            names = [m.name for m in self.meshes]
+            raise SceneError(f"scene '{self.name}': no mesh '{min(unknown)}', meshes are {names}")
         meshes = tuple(moved.get(m.name, m) for m in self.meshes)
         return replace(self, meshes=meshes, lights=tuple(lights))
 

@@ -40,7 +40,7 @@ def load_scene(source: str | Path) -> Scene:
         if text in bundled_scenes():
             path = _bundled_folder() / f"{text}.glb"
         elif not path.suffix and not path.exists():
-            raise SceneError(f"scene '{text}': no bundled scene of that name; bundled are {', '.join(bundled_scenes())}")
+            raise SceneError(f"scene '{text}': no such bundled scene, there are {', '.join(bundled_scenes())}")
         else:
             raise SceneError(f"{text}: unknown scene format '{path.suffix}', expected {', '.join(SCENE_SUFFIXES)}")
     if not path.is_file():

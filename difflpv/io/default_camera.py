@@ -15,7 +15,7 @@ _YFOV = float(np.radians(50.0))
 def default_camera(scene: Scene) -> Camera:
     """Camera that looks at the middle of the scene's bounds.
 
-    A room is looked at from inside, out of the upper corner with the freest view; an object from outside. A scene counts
+    A room is looked at from inside, from the candidate with the freest view; an object from outside. A scene counts
     as a room if it blocks the view into its bounds right where most of the outside candidates' rays enter them.
     """
     low, high = scene.bounds
@@ -32,14 +32,24 @@ def default_camera(scene: Scene) -> Camera:
     if (hit > entry + 0.1 * radius).sum() >= 2:
         return _look_at(outside[int(np.argmax(hit - entry))], middle)
 
-    inside = middle + 0.8 * half * (signs * [1.0, 0.6, 1.0])
-    cameras = [_look_at(position, middle) for position in inside]
-    u = (np.arange(8) + 0.5) / 8
-    views = []
-    for camera in cameras:
-        grid = np.stack(np.meshgrid(u * camera.width, u * camera.height), -1).reshape(-1, 2)
-        views.append(float(np.median(np.minimum(rays.closest(*camera.rays(grid)).distance, 2 * radius))))
+    angles = np.arange(16) * np.pi / 8
+    cameras, views = [], []
+    for reach in (0.8, 0.6, 0.4):
+        for height in (0.4, 0.0):
+            for angle in angles:
+                camera = _look_at(middle + half * [reach * np.cos(angle), height, reach * np.sin(angle)], middle)
+                cameras.append(camera)
+                views.append(_openness(rays, camera, radius))
     return cameras[int(np.argmax(views))]
+
+
+def _openness(rays: Raycaster, camera: Camera, radius: float) -> float:
+    """Mean log distance of what the camera sees; what is close, and what looks out of the scene, counts against it."""
+    u = (np.arange(8) + 0.5) / 8
+    offsets = np.stack(np.meshgrid(u * camera.width, u * camera.height), -1).reshape(-1, 2)
+    distance = rays.closest(*camera.rays(offsets)).distance
+    distance = np.where(np.isfinite(distance), distance, 0.0)
+    return float(np.log(np.maximum(distance, 0.02 * radius)).mean())
 
 
 def _look_at(position: np.ndarray, target: np.ndarray) -> Camera:

@@ -1,7 +1,7 @@
 """OpenEXR images with named float32 channels: ``R,G,B`` and, where known, ``stderr.R,stderr.G,stderr.B``.
 
-The OpenEXR library parses whatever a header claims, so the header is walked and bounded here first: one part, scanlines,
-a plain lossless codec, a bounded number of pixels. Source: "OpenEXR File Layout", openexr.com.
+The OpenEXR library parses whatever a header claims, so the header is walked and bounded here first: one part,
+scanlines, a plain lossless codec, a bounded number of pixels. Source: "OpenEXR File Layout", openexr.com.
 """
 
 from __future__ import annotations
@@ -151,7 +151,8 @@ def write_exr(
         pixels[name] = np.ascontiguousarray(image, np.float32)
         first = next(iter(pixels.values()))
         if pixels[name].ndim != 2 or pixels[name].shape != first.shape or not pixels[name].size:
-            raise ImageError(f"{path}: channel '{name}': expected shape [H, W] as the others, got {list(np.shape(image))}")
+            shape = list(np.shape(image))
+            raise ImageError(f"{path}: channel '{name}': expected shape [H, W] as the others, got {shape}")
         bad = int((~np.isfinite(pixels[name])).sum())
         if bad:
             raise ImageError(f"{path}: channel '{name}': {bad} pixels are not finite")

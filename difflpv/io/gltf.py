@@ -70,7 +70,8 @@ class _Reader:
             scene = doc.element("scenes", doc.json.get("scene", 0), "scene")
             roots = doc.array(scene, "nodes", "scene nodes")
         else:
-            children = {c for n in nodes if isinstance(n, dict) for c in doc.array(n, "children", "node") if type(c) is int}
+            parents = [n for n in nodes if isinstance(n, dict)]
+            children = {c for n in parents for c in doc.array(n, "children", "node") if type(c) is int}
             scene, roots = {}, [i for i in range(len(nodes)) if i not in children]
         worlds: dict[int, np.ndarray] = {}
         pending = [(root, np.eye(4), "scene") for root in roots]
@@ -144,7 +145,8 @@ class _Reader:
         where = f"{at} KHR_texture_transform"
         angle = number(transform.get("rotation", 0.0), where)
         rotation = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
-        scale, offset = numbers(transform.get("scale", [1, 1]), 2, where), numbers(transform.get("offset", [0, 0]), 2, where)
+        scale = numbers(transform.get("scale", [1, 1]), 2, where)
+        offset = numbers(transform.get("offset", [0, 0]), 2, where)
         with np.errstate(all="ignore"):
             return (uv * scale) @ rotation.T + offset
 
@@ -231,7 +233,7 @@ class _Reader:
             image = doc.child(extras, "image", "scene extras 'image'")
             size = [image.get("width"), image.get("height")]
         if any(type(n) is not int or not 1 <= n <= _MAX_IMAGE_EDGE for n in size):
-            raise SceneError(f"scene extras 'image': expected width and height in 1..{_MAX_IMAGE_EDGE}, got {str(size)[:60]}")
+            raise SceneError(f"scene extras 'image': expected edges in 1..{_MAX_IMAGE_EDGE}, got {str(size)[:60]}")
         to_world = np.eye(4)
         to_world[:3, :3], to_world[:3, 3] = _unit_columns(world, f"{where} {at}"), world[:3, 3]
         self.builder.cameras.append(Camera(to_world, yfov, *size))
@@ -290,7 +292,7 @@ def _grid(entry: Any) -> Grid:
     low, high = numbers(entry.get("min"), 3, f"{where} min"), numbers(entry.get("max"), 3, f"{where} max")
     cells = numbers(entry.get("resolution"), 3, f"{where} resolution")
     if (cells != np.round(cells)).any() or (cells < 1).any() or cells.prod() > _MAX_CELLS:
-        raise SceneError(f"{where} resolution: expected positive integers, at most {_MAX_CELLS} cells, got {cells.tolist()}")
+        raise SceneError(f"{where} resolution: expected integers > 0, at most {_MAX_CELLS} cells, got {cells.tolist()}")
     try:
         return Grid.from_bounds(low, high, cells.astype(int))
     except ValueError as error:

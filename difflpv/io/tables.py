@@ -159,8 +159,9 @@ def save_table(path: str | Path, **arrays: Any) -> None:
         array = np.ascontiguousarray(value)
         if array.dtype.hasobject:
             raise TableError(f"{path}: array '{name}' holds Python objects, expected numbers or text")
-        if array.dtype.kind in "fc" and not np.isfinite(array).all():
-            raise TableError(f"{path}: array '{name}' holds {int((~np.isfinite(array)).sum())} values that are not finite")
+        bad = int((~np.isfinite(array)).sum()) if array.dtype.kind in "fc" else 0
+        if bad:
+            raise TableError(f"{path}: array '{name}' holds {bad} values that are not finite")
         checked[name] = array.reshape(np.shape(value))
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         np.savez_compressed(file, allow_pickle=False, **checked)
