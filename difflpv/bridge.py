@@ -1,11 +1,12 @@
 """Torch tensors into Warp launches, and what a custom op must refuse.
 
-Every op of the project is a ``torch.library.custom_op`` whose body launches hand-written Warp kernels. Warp sees detached,
-contiguous tensors that torch allocated; no ``wp.Tape`` is involved. Importing this module initialises Warp.
+Every op of the project is a ``torch.library.custom_op`` whose body launches hand-written Warp kernels. Warp sees
+detached, contiguous tensors that torch allocated; no ``wp.Tape`` is involved. Importing this module initialises Warp.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -14,8 +15,28 @@ import warp as wp
 
 __all__ = ["as_warp", "check_float", "launch", "refuse_forward_mode", "refuse_second_derivative", "warp_scalar"]
 
-wp.config.log_level = wp.LOG_ERROR  # the banner and the missing-driver warning are no news to a CPU user
-wp.init()
+
+def _init_quietly() -> None:
+    """Initialise Warp; without CUDA keep its native "no driver" line, which no setting turns off, from stderr."""
+    wp.config.log_level = wp.LOG_ERROR
+    if torch.cuda.is_available():
+        wp.init()
+        return
+    try:
+        stderr = os.dup(2)
+    except OSError:  # the process runs without one
+        wp.init()
+        return
+    with open(os.devnull, "w") as nowhere:
+        os.dup2(nowhere.fileno(), 2)
+        try:
+            wp.init()
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
+
+
+_init_quietly()
 
 _SCALARS = {torch.float32: wp.float32, torch.float64: wp.float64}
 

@@ -4,7 +4,8 @@ Index ``l(l+1)+m``; degree ``l <= l_max`` ("band" in the graphics literature: LP
 convention of the project; publications differ in the sign of x and y. Works on numpy arrays and torch tensors alike and
 imports neither torch nor Warp, so that path-tracing workers start quickly.
 
-    Y = 1/(2 sqrt(pi)) [1, sqrt3 y, sqrt3 z, sqrt3 x, sqrt15 xy, sqrt15 yz, sqrt5/2 (3z^2-1), sqrt15 xz, sqrt15/2 (x^2-y^2)]
+    Y = 1/(2 sqrt(pi)) [1, sqrt3 y, sqrt3 z, sqrt3 x,
+                        sqrt15 xy, sqrt15 yz, sqrt5/2 (3z^2-1), sqrt15 xz, sqrt15/2 (x^2-y^2)]
 
 Source: Ramamoorthi and Hanrahan 2001 (cosine lobe A_l); Sloan 2008 (polynomial forms).
 """
