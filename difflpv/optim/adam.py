@@ -85,17 +85,17 @@ def solve_adam(
         callback=callback,
         options=options,
     )
-    raw = problem.to_raw(problem.initial)
-    optimizer = torch.optim.Adam([raw], lr=lr)
-    # Loss and step of the last improvement by more than the tolerance.
-    reference_loss, reference_step = math.inf, 0
-    if run.state is not None:
-        raw.copy_(run.state["raw"])
-        optimizer.load_state_dict(run.state["optimizer"])
-        reference_loss, reference_step = run.state["reference"]
 
     def loop() -> tuple[Status, str]:
-        nonlocal reference_loss, reference_step
+        # In here, because torch loads its compiler with its first optimiser: seconds in which Ctrl-C must count too.
+        raw = problem.to_raw(problem.initial)
+        optimizer = torch.optim.Adam([raw], lr=lr)
+        # Loss and step of the last improvement by more than the tolerance.
+        reference_loss, reference_step = math.inf, 0
+        if run.state is not None:
+            raw.copy_(run.state["raw"])
+            optimizer.load_state_dict(run.state["optimizer"])
+            reference_loss, reference_step = run.state["reference"]
         while True:
             if tolerance > 0 and run.step - reference_step >= patience:
                 return Status.CONVERGED, f"converged after {run.step} steps"

@@ -73,35 +73,36 @@ def solve_lbfgs(
         callback=callback,
         options={"lr": lr, "memory": memory, "patience": patience},
     )
-    raw = problem.to_raw(problem.initial)
-    optimizer = torch.optim.LBFGS(
-        [raw],
-        lr=lr,
-        max_iter=1,
-        max_eval=_LINE_SEARCH_EVALUATIONS,
-        history_size=memory,
-        tolerance_grad=0.0,
-        tolerance_change=1e-15,
-        line_search_fn="strong_wolfe",
-    )
-    # Each step of torch's L-BFGS begins by evaluating the point at which the last one ended: remembered, not repeated.
-    known: dict[bytes, tuple[float, Tensor]] = {}
-    stalled = 0
-    if run.state is not None:
-        raw.copy_(run.state["raw"])
-        optimizer.load_state_dict(run.state["optimizer"])
-        known[_key(raw)] = run.state["loss"], run.state["gradient"]
-        stalled = run.state["stalled"]
-
-    def closure() -> float:
-        key = _key(raw)
-        if key not in known:
-            known[key] = run.value_and_grad(raw, space="raw")
-        raw.grad = known[key][1].clone()
-        return known[key][0]
 
     def loop() -> tuple[Status, str]:
-        nonlocal stalled
+        # In here, because torch loads its compiler with its first optimiser: seconds in which Ctrl-C must count too.
+        raw = problem.to_raw(problem.initial)
+        optimizer = torch.optim.LBFGS(
+            [raw],
+            lr=lr,
+            max_iter=1,
+            max_eval=_LINE_SEARCH_EVALUATIONS,
+            history_size=memory,
+            tolerance_grad=0.0,
+            tolerance_change=1e-15,
+            line_search_fn="strong_wolfe",
+        )
+        # Each step of torch's L-BFGS begins by evaluating the point where the last one ended: remembered, not repeated.
+        known: dict[bytes, tuple[float, Tensor]] = {}
+        stalled = 0
+        if run.state is not None:
+            raw.copy_(run.state["raw"])
+            optimizer.load_state_dict(run.state["optimizer"])
+            known[_key(raw)] = run.state["loss"], run.state["gradient"]
+            stalled = run.state["stalled"]
+
+        def closure() -> float:
+            key = _key(raw)
+            if key not in known:
+                known[key] = run.value_and_grad(raw, space="raw")
+            raw.grad = known[key][1].clone()
+            return known[key][0]
+
         while True:
             if stalled >= patience:
                 return Status.CONVERGED, f"converged after {run.step} steps"
