@@ -41,6 +41,8 @@ class Grid:
         """Grid over ``minimum``..``maximum`` [m]; the bounds must give cubic cells."""
         low, high = np.asarray(minimum, float), np.asarray(maximum, float)
         count = np.broadcast_to(np.asarray(resolution, int), (3,))
+        if (count < 1).any() or (count != np.asarray(resolution)).any():
+            raise ValueError(f"grid resolution: expected positive integers, got {np.asarray(resolution).tolist()}")
         size = (high - low) / count
         if not (size > 0).all() or size.max() - size.min() > 1e-4 * size.max():
             raise ValueError(f"grid bounds: expected cubic cells, got {count.tolist()} cells of {size.tolist()} m")

@@ -67,11 +67,12 @@ class Raycaster:
         """True where a ray meets a triangle within ``distance`` [n] or scalar, m; ``np.inf`` for a parallel light."""
         if not len(origins):
             return np.zeros(0, bool)
-        limit = np.minimum(np.broadcast_to(np.asarray(distance, np.float64), (len(origins),)), 1e30)
+        # Embree takes a negative limit for none at all: nothing lies within such a distance.
+        limit = np.clip(np.broadcast_to(np.asarray(distance, np.float64), (len(origins),)), 0.0, 1e30)
         hits = self._scene.run(
             np.ascontiguousarray(origins, np.float32),
             np.ascontiguousarray(directions, np.float32),
             dists=np.ascontiguousarray(limit, np.float32),
             query="OCCLUDED",
         )
-        return np.asarray(hits) >= 0
+        return (np.asarray(hits) >= 0) & (limit > 0)

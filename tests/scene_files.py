@@ -5,7 +5,11 @@ import json
 import struct
 
 import numpy as np
+from hypothesis import HealthCheck
 from PIL import Image
+
+# Settings of the fuzz tests: the same examples every time, files in a tmp_path that the examples share.
+FUZZ = {"deadline": None, "suppress_health_check": [HealthCheck.function_scoped_fixture], "derandomize": True}
 
 QUAD = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
 QUAD_INDICES = np.array([0, 1, 2, 0, 2, 3], np.uint16)

@@ -3,9 +3,9 @@ import struct
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from scene_files import PLY, check_usable
+from scene_files import FUZZ, PLY, check_usable
 
 from difflpv.io import load_scene
 from difflpv.scene import DirectionalLight, SceneError
@@ -39,7 +39,10 @@ def binary(order=">", normals=False):
     return header.encode() + b"end_header\n" + body
 
 
-@pytest.mark.parametrize("content", [PLY, binary(">"), binary("<"), binary("<", True)], ids=["ascii", "big", "little", "more"])
+FORMS = {"ascii": PLY, "big": binary(">"), "little": binary("<"), "more": binary("<", True)}
+
+
+@pytest.mark.parametrize("content", FORMS.values(), ids=FORMS)
 def test_mixed_polygons(tmp_path, content):
     scene = load(tmp_path, content)
     (mesh,) = scene.meshes
@@ -103,7 +106,7 @@ def test_every_truncation_of_binary(tmp_path):
         message(tmp_path, content[:length])
 
 
-@settings(max_examples=400, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=400, **FUZZ)
 @given(
     st.sampled_from([PLY.encode(), binary("<"), binary(">", True)]),
     st.lists(st.tuples(st.integers(0, 400), st.integers(0, 255) | st.sampled_from(b"0123456789 -.e\n")), max_size=5),

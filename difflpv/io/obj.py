@@ -79,7 +79,7 @@ def _statements(content: bytes) -> list[tuple[int, str]]:
     """Numbered statements without comments, white space made single, continued lines joined."""
     statements: list[tuple[int, str]] = []
     pending, start = "", 0
-    for number, raw in enumerate(content.decode("utf-8", "replace").split("\n"), 1):
+    for number, raw in enumerate(content.decode("utf-8-sig", "replace").split("\n"), 1):
         line = raw.strip()
         if line.startswith("#"):
             continue

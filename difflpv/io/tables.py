@@ -84,7 +84,7 @@ def _real(name: str, value: Any, shape: tuple[int | None, ...]) -> np.ndarray:
     if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True)):
         raise TableError(f"{name}: expected shape {wanted}, got {list(array.shape)}")
     array = np.ascontiguousarray(array, np.float64)
-    bad = np.flatnonzero(~np.isfinite(array.reshape(len(array), -1)).all(1))
+    bad = np.flatnonzero(~np.isfinite(array).all(axis=tuple(range(1, array.ndim))))
     if bad.size:
         raise TableError(f"{name}: row {bad[0]} is not finite: {array[bad[0]].tolist()}")
     return array
