@@ -97,6 +97,14 @@ def test_geometry_agrees_with_trimesh(name):
 # Transforms and geometry ----------------------------------------------------------------------------------------------
 
 
+def test_no_material_is_told(tmp_path):
+    gltf = small_gltf()
+    del gltf.json["meshes"][0]["primitives"][0]["material"]
+    scene = load(tmp_path, gltf)
+    np.testing.assert_allclose(scene.meshes[0].material.albedo, [0.8, 0.8, 0.8])
+    assert "mesh 'floor' primitive 0: no material, the albedo is 0.8" in scene.warnings
+
+
 def test_hierarchy_of_trs_and_matrix(tmp_path):
     gltf = small_gltf()
     half = math.sqrt(0.5)

@@ -31,6 +31,11 @@ class SceneBuilder:
     _taken: dict[str, int] = field(default_factory=dict)
     _corners: int = 0
 
+    def default_material(self, where: str) -> Material:
+        """The surface of a mesh that names none, told."""
+        self.warnings.append(f"{where}: no material, the albedo is {DEFAULT_ALBEDO}")
+        return Material("default", np.full(3, DEFAULT_ALBEDO))
+
     def reserve(self, count: int) -> None:
         """Count ``count`` triangle corners or vertices that are about to be made; refuse to grow without bound."""
         self._corners += count

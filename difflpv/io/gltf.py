@@ -153,7 +153,7 @@ class _Reader:
     def _material(self, index: Any, at: str) -> tuple[Material, dict[str, Any]]:
         """The material, and its ``baseColorTexture`` object (empty if it has none)."""
         if index is None:
-            return Material("default", np.ones(3), double_sided=False), {}
+            return self.builder.default_material(at), {}
         doc = self.document
         entry = doc.element("materials", index, at)
         if index not in self._materials:

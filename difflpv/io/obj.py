@@ -67,10 +67,10 @@ def load_obj(path: Path) -> Scene:
                 raise SceneError(f"line {number}: material '{material[:80]}' is not in the MTL files read so far")
         elif keyword == "mtllib":
             _load_mtl(path.parent / rest.strip().replace("\\", "/"), number, materials, textures, builder)
-    default = Material("default", np.full(3, DEFAULT_ALBEDO))
     position, uv = np.array(vertices).reshape(-1, 3), np.array(uvs).reshape(-1, 2)
     for group in groups.values():
-        surface = default if group.material is None else materials[group.material]
+        name = group.material
+        surface = builder.default_material(f"mesh '{group.name}'") if name is None else materials[name]
         _add_group(builder, group, surface, position, uv)
     return builder.build()
 

@@ -15,8 +15,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from difflpv.io.assemble import DEFAULT_ALBEDO, SceneBuilder
-from difflpv.scene import DirectionalLight, Material, Scene, SceneError
+from difflpv.io.assemble import SceneBuilder
+from difflpv.scene import DirectionalLight, Scene, SceneError
 
 __all__ = ["load_ply"]
 
@@ -73,8 +73,8 @@ def load_ply(path: Path) -> Scene:
     builder = SceneBuilder(path.stem)
     builder.reserve(len(vertices) + sum(3 * max(len(p) - 2, 0) for p in polygons))
     if kinds.keys() & {("vertex", "red"), ("face", "red")}:
-        builder.warnings.append(f"vertex and face colours are not used, the albedo is {DEFAULT_ALBEDO}")
-    builder.add_mesh(path.stem, vertices, _fan(polygons), Material("default", np.full(3, DEFAULT_ALBEDO)))
+        builder.warnings.append("vertex and face colours are not used")
+    builder.add_mesh(path.stem, vertices, _fan(polygons), builder.default_material(f"mesh '{path.stem}'"))
     builder.lights.append(DirectionalLight(np.array(_LIGHT_DIRECTION), np.ones(3), "default"))
     builder.warnings.append("PLY holds no light: a directional light of 1 W/m2 was added, a light set replaces it")
     return builder.build()
