@@ -511,7 +511,7 @@ def test_hostile_json_values(tmp_path, changes):
     gltf = copy.deepcopy(RICH)
     for path, value in changes:
         try:
-            _set(path, value)(gltf)
+            _set(path, copy.deepcopy(value))(gltf)
         except (TypeError, KeyError, IndexError):
             pass  # an earlier change removed the parent
     _survives(tmp_path, gltf.glb(), "fuzz.glb")

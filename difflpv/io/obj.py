@@ -69,8 +69,8 @@ def load_obj(path: Path) -> Scene:
             _load_mtl(path.parent / rest.strip().replace("\\", "/"), number, materials, textures, builder)
     position, uv = np.array(vertices).reshape(-1, 3), np.array(uvs).reshape(-1, 2)
     for group in groups.values():
-        name = group.material
-        surface = builder.default_material(f"mesh '{group.name}'") if name is None else materials[name]
+        key = group.material
+        surface = builder.default_material(f"mesh '{group.name}'") if key is None else materials[key]
         _add_group(builder, group, surface, position, uv)
     return builder.build()
 
