@@ -72,7 +72,7 @@ def measure(stencil: FaceStencil, cells: int, steps: int, repeats: int) -> dict[
     volume = torch.randn(3, coeffs, cells, cells, cells, generator=generator)
     volume[:, 0] = volume[:, 0].abs() * 3
     passed = torch.rand(len(stencil.offsets), cells, cells, cells, generator=generator)
-    linear = stencil.linear()
+    linear = stencil.linear_part
     weight = torch.zeros(coeffs, coeffs, 3, 3, 3)
     for n, matrix in zip(linear.offsets.tolist(), linear.matrices, strict=True):
         weight[:, :, 1 - n[2], 1 - n[1], 1 - n[0]] = torch.tensor(matrix, dtype=torch.float32)

@@ -32,15 +32,15 @@ def _convolve(field: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
 
 
 def _correlations(after: torch.Tensor, before: torch.Tensor, offsets: torch.Tensor) -> torch.Tensor:
-    """sum over cells d and colours of after(d) before(d - n)^T for every offset n, shape [n,K,K]."""
+    """Sum over cells d and colours of after(d) before(d - n)^T for every offset n, shape [n,K,K]."""
     sums = []
     for n in offsets.tolist():
         here, there = [], []
         for step, size in zip(reversed(n), after.shape[2:], strict=True):
             here.append(slice(max(step, 0), size + min(step, 0)))
             there.append(slice(max(-step, 0), size + min(-step, 0)))
-        a = after[(..., *here)].movedim(1, -1).reshape(-1, after.shape[1])
-        b = before[(..., *there)].movedim(1, -1).reshape(-1, before.shape[1])
+        a = after[..., here[0], here[1], here[2]].movedim(1, -1).reshape(-1, after.shape[1])
+        b = before[..., there[0], there[1], there[2]].movedim(1, -1).reshape(-1, before.shape[1])
         sums.append(a.T @ b)
     return torch.stack(sums)
 
@@ -75,7 +75,7 @@ def _state_shape(volume: torch.Tensor, slots: int) -> tuple[int, ...]:
 
 
 @_propagate.register_fake
-def _(volume, offsets, matrices, factors, tolerance, keep):  # type: ignore[no-untyped-def]
+def _(volume, offsets, matrices, factors, tolerance, keep):
     states = volume.new_empty(_state_shape(volume, len(factors) if keep else 0))
     return torch.empty_like(volume, memory_format=torch.contiguous_format), states, torch.empty((), dtype=torch.int64)
 
@@ -102,7 +102,7 @@ def _propagate_backward(
 
 
 @_propagate_backward.register_fake
-def _(total_bar, states, done, offsets, matrices, factors, need_matrices, need_factors):  # type: ignore[no-untyped-def]
+def _(total_bar, states, done, offsets, matrices, factors, need_matrices, need_factors):
     bar = torch.empty_like(total_bar, memory_format=torch.contiguous_format)
     return bar, torch.empty_like(matrices), torch.empty_like(factors)
 

@@ -18,7 +18,7 @@ import warp as wp
 
 from difflpv.bridge import as_warp, launch, refuse_second_derivative, warp_scalar
 from difflpv.stencil import FaceStencil
-from warp_kernels.propagation import CPU_LANES, StepKernels, step_kernels
+from warp_kernels.propagation import CPU_LANES, adjoint_kernel, forward_kernel
 
 __all__ = ["propagate_faces"]
 
@@ -32,7 +32,7 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 @dataclass(frozen=True)
 class _Layout:
-    """Padded fields of one volume shape; see ``warp_kernels.propagation``."""
+    """Padded buffers of one volume shape; see ``warp_kernels.propagation``."""
 
     channels: int
     coeffs: int
@@ -47,12 +47,12 @@ class _Layout:
         return cls(channels, coeffs, z, y, x, 1 if volume.is_cuda else CPU_LANES)
 
     @property
-    def row(self) -> int:
-        return -(-self.x // self.lanes) * self.lanes + 2
+    def fields(self) -> int:
+        return self.channels * self.coeffs
 
     @property
-    def cells(self) -> int:
-        return (self.z + 2) * (self.y + 2) * self.row
+    def pitch(self) -> int:
+        return -(-self.x // self.lanes) * self.lanes + 2
 
     @property
     def group(self) -> int:
@@ -60,11 +60,15 @@ class _Layout:
         return 3 if self.channels % 3 == 0 else 1
 
     @property
+    def groups(self) -> int:
+        return self.channels // self.group
+
+    @property
     def rows(self) -> int:
-        return self.channels // self.group * self.z * self.y
+        return self.groups * self.z * self.y
 
     def length(self, fields: int) -> int:
-        return fields * self.cells + self.lanes
+        return (self.z + 2) * (self.y + 2) * fields * self.pitch + self.lanes
 
     def empty(self, fields: int, like: torch.Tensor) -> torch.Tensor:
         """Zeroed flat buffer of so many padded scalar fields."""
@@ -72,8 +76,8 @@ class _Layout:
 
     def inside(self, buffer: torch.Tensor, fields: int) -> torch.Tensor:
         """View of the cells without halo, shape [fields, n_z, n_y, n_x]."""
-        view = buffer[: fields * self.cells].view(fields, self.z + 2, self.y + 2, self.row)
-        return view[:, 1:-1, 1:-1, 1 : self.x + 1]
+        view = buffer[: -self.lanes].view(self.z + 2, self.y + 2, fields, self.pitch)
+        return view[1:-1, 1:-1, :, 1 : self.x + 1].permute(2, 0, 1, 3)
 
     def pad(self, field: torch.Tensor, into: torch.Tensor | None = None) -> torch.Tensor:
         """Flat padded copy of a field [..., n_z, n_y, n_x]."""
@@ -90,62 +94,71 @@ class _Steps:
         self, layout: _Layout, factors: torch.Tensor, transmittance: torch.Tensor, offsets: torch.Tensor,
         axis: torch.Tensor, weights: torch.Tensor, lobes: torch.Tensor, clamp: bool, occlude_first_step: bool,
     ) -> None:  # fmt: skip
-        self.layout, self.lobes, self.device = layout, lobes.detach(), factors.device
-        self.clamp, self.occlude_first_step = clamp, occlude_first_step
-        self.kernels: StepKernels = step_kernels(
-            warp_scalar(factors.dtype), coeffs=layout.coeffs, axes=len(lobes), channels=layout.group, lanes=layout.lanes
-        )
-        self.occluded = len(transmittance) > 0
-        n = offsets.cpu().numpy()
-        flat = (n[:, 2] * (layout.y + 2) + n[:, 1]) * layout.row + n[:, 0]
-        shifts, neighbour = np.unique(flat, return_inverse=True)
-        first = np.concatenate([[0], np.cumsum(np.bincount(neighbour.ravel()))])
-        self.pairs, self.neighbours = len(n) // 2, len(shifts)
-        topology = {"shift": shifts, "first": first, "face": np.argsort(neighbour.ravel(), kind="stable"), "face_shift": flat}
-        self._tensors = {k: torch.tensor(v, dtype=torch.int32, device=self.device) for k, v in topology.items()}
-        self._tensors |= {"axis": axis.to(torch.int32), "weights": weights, "lobes": lobes, "factor": factors}
-        self._tensors["transmittance"] = layout.pad(transmittance) if self.occluded else transmittance
-        self._tensors = {k: v.detach().contiguous().reshape(-1) for k, v in self._tensors.items()}
+        self.layout, self.device, self.axes = layout, factors.device, len(lobes)
+        self.clamp, self.occlude_first_step, self.occluded = clamp, occlude_first_step, len(transmittance) > 0
+        self._scalar = warp_scalar(factors.dtype)
+        cells = offsets.cpu().numpy()
+        neighbours, owner = np.unique(cells, axis=0, return_inverse=True)
+        owner = owner.ravel()
+        self.faces, self.neighbours = len(cells), len(neighbours)
+        topology = {
+            "line_shift": neighbours[:, 2] * (layout.y + 2) + neighbours[:, 1],
+            "x_shift": neighbours[:, 0],
+            "first": np.concatenate([[0], np.cumsum(np.bincount(owner))]),
+            "face": np.argsort(owner, kind="stable"),
+            "face_neighbour": owner,
+        }
+        tensors = {k: torch.tensor(v, dtype=torch.int32, device=self.device) for k, v in topology.items()}
+        tensors |= {"axis": axis.to(torch.int32), "weights": weights, "lobes": lobes, "factor": factors}
+        tensors["transmittance"] = layout.pad(transmittance) if self.occluded else transmittance
+        self._tensors = {k: v.detach().contiguous().reshape(-1) for k, v in tensors.items()}  # keeps them alive
         self._views = {k: as_warp(v) for k, v in self._tensors.items()}
 
     def occlude(self, step: int) -> bool:
         """True where the transmittance acts on this step."""
         return self.occluded and (step > 0 or self.occlude_first_step)
 
+    def _spec(self, step: int) -> dict[str, Any]:
+        return {
+            "coeffs": self.layout.coeffs, "axes": self.axes, "channels": self.layout.group,
+            "lanes": self.layout.lanes, "clamp": self.clamp, "occluded": self.occlude(step),
+        }  # fmt: skip
+
     def forward(self, moving: torch.Tensor, into: torch.Tensor, total: torch.Tensor, step: int) -> None:
         """S_{step+1} from S_step, added onto ``total``; all flat padded buffers."""
         v, layout = self._views, self.layout
         arguments = [
             as_warp(moving), as_warp(into), as_warp(total), v["transmittance"], v["weights"], v["lobes"], v["factor"],
-            v["shift"], v["first"], v["face"], v["axis"], self.neighbours, int(self.clamp), int(self.occlude(step)), step,
-            layout.cells, layout.y + 2, layout.row, layout.z, layout.y, layout.x,
+            v["line_shift"], v["x_shift"], v["first"], v["face"], v["axis"], self.neighbours, self.faces, step, layout.y + 2,
+            layout.pitch, layout.groups, layout.z, layout.y, layout.x,
         ]  # fmt: skip
-        self._launch(self.kernels.forward, arguments)
+        self._launch(forward_kernel(self._scalar, **self._spec(step)), arguments)
 
     def adjoint(
-        self, moving: torch.Tensor | None, after: torch.Tensor, lobe_bar: torch.Tensor, total_bar: torch.Tensor,
-        into: torch.Tensor, transmittance_bar: torch.Tensor, factor_bar: torch.Tensor, step: int,
+        self, moving: torch.Tensor, lobe_bar: torch.Tensor, into: torch.Tensor, total_bar: torch.Tensor,
+        volume_bar: torch.Tensor, transmittance_bar: torch.Tensor, factor_bar: torch.Tensor, step: int, *, start: bool = False,
     ) -> None:  # fmt: skip
-        """G_step from G_{step+1} (``after``); adds onto ``transmittance_bar`` (unless empty) and ``factor_bar``."""
+        """H_step ``into`` from H_{step+1}; adds onto ``transmittance_bar`` and ``factor_bar`` unless they are empty.
+
+        ``start`` takes no step: it leaves H of ``total_bar``. Without clamp and factors ``moving`` is not read.
+        """
         v, layout = self._views, self.layout
-        states = after[: layout.channels * layout.coeffs * layout.cells].view(layout.channels, layout.coeffs, -1)
-        products = lobe_bar[: layout.channels * len(self.lobes) * layout.cells].view(layout.channels, len(self.lobes), -1)
-        torch.matmul(self.lobes, states, out=products)
+        need_transmittance = len(transmittance_bar) > 0 and self.occlude(step)
+        flags = {"need_factor": len(factor_bar) > 0, "need_transmittance": need_transmittance}
         arguments = [
-            as_warp(after if moving is None else moving), as_warp(lobe_bar), as_warp(total_bar), as_warp(into),
-            v["transmittance"], as_warp(transmittance_bar), as_warp(factor_bar), v["weights"], v["factor"], v["face_shift"],
-            v["axis"], self.pairs, int(self.clamp), int(self.occlude(step)), int(moving is not None),
-            int(len(transmittance_bar) > 0 and self.occlude(step)), step, layout.cells, layout.y + 2, layout.row,
-            layout.channels // layout.group, layout.z, layout.y, layout.x,
+            as_warp(moving), as_warp(lobe_bar), as_warp(into), as_warp(total_bar), as_warp(volume_bar), v["transmittance"],
+            as_warp(transmittance_bar), as_warp(factor_bar), v["weights"], v["lobes"], v["factor"], v["line_shift"],
+            v["x_shift"], v["face_neighbour"], v["axis"], 0 if start else self.faces // 2, self.faces, int(step == 0), step,
+            layout.y + 2, layout.pitch, layout.groups, layout.z, layout.y, layout.x,
         ]  # fmt: skip
-        self._launch(self.kernels.adjoint, arguments)
+        self._launch(adjoint_kernel(self._scalar, **self._spec(step), **flags), arguments)
 
     def _launch(self, kernel: Any, arguments: list[Any]) -> None:
         rows = self.layout.rows
         if self.device.type == "cuda":
             launch(kernel, (rows, self.layout.x), [*arguments, 0], self.device)
             return
-        kernel.module.load("cpu")  # once, before threads race for it
+        kernel.module.load(wp.get_device("cpu"), block_dim=1)  # once, before threads race for it; 1 is what launches use
         threads = max(1, min(torch.get_num_threads(), rows))
         bounds = [rows * i // threads for i in range(threads + 1)]
 
@@ -168,34 +181,35 @@ def _propagate(
     weights: torch.Tensor, lobes: torch.Tensor, clamp: bool, occlude_first_step: bool, tolerance: float, keep: int,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
     layout = _Layout.of(volume)
-    fields = layout.channels * layout.coeffs
+    fields = layout.fields
     steps = _Steps(layout, factors, transmittance, offsets, axis, weights, lobes, clamp, occlude_first_step)
     count = len(factors)
     states = volume.new_zeros((_slots(count, keep), layout.length(fields)))
-    moving, spare = layout.pad(volume), layout.empty(fields, volume)
-    total = moving.clone()
+    scratch = [layout.empty(fields, volume) for _ in range(2 if keep != 1 else 1)]
+
+    def home(step: int) -> torch.Tensor:
+        kept = keep and step < count and step % keep == 0
+        return states[step // keep] if kept else scratch[step % len(scratch)]
 
     def flux(buffer: torch.Tensor) -> float:
         return float(layout.inside(buffer, fields)[:: layout.coeffs].abs().sum())
 
-    injected = flux(moving) if tolerance else 0.0
+    total = layout.pad(volume, into=home(0)).clone()
+    injected = flux(home(0)) if tolerance else 0.0
     done = count
     for step in range(count):
-        if tolerance and flux(moving) <= tolerance * injected:
+        if tolerance and flux(home(step)) <= tolerance * injected:
             done = step
             break
-        if keep and step % keep == 0:
-            states[step // keep].copy_(moving)
-        steps.forward(moving, spare, total, step)
-        moving, spare = spare, moving
+        steps.forward(home(step), home(step + 1), total, step)
     accumulated = layout.inside(total, fields).reshape(volume.shape).contiguous()
     return accumulated, states, torch.tensor(done)
 
 
 @_propagate.register_fake
-def _(volume, factors, transmittance, offsets, axis, weights, lobes, clamp, occlude_first_step, tolerance, keep):  # type: ignore[no-untyped-def]
+def _(volume, factors, transmittance, offsets, axis, weights, lobes, clamp, occlude_first_step, tolerance, keep):
     layout = _Layout.of(volume)
-    states = volume.new_empty((_slots(len(factors), keep), layout.length(layout.channels * layout.coeffs)))
+    states = volume.new_empty((_slots(len(factors), keep), layout.length(layout.fields)))
     return torch.empty_like(volume, memory_format=torch.contiguous_format), states, torch.empty((), dtype=torch.int64)
 
 
@@ -203,45 +217,50 @@ def _(volume, factors, transmittance, offsets, axis, weights, lobes, clamp, occl
 def _propagate_backward(
     accumulated_bar: torch.Tensor, states: torch.Tensor, done: torch.Tensor, factors: torch.Tensor,
     transmittance: torch.Tensor, offsets: torch.Tensor, axis: torch.Tensor, weights: torch.Tensor, lobes: torch.Tensor,
-    clamp: bool, occlude_first_step: bool, keep: int, need_transmittance: bool,
+    clamp: bool, occlude_first_step: bool, keep: int, need_factors: bool, need_transmittance: bool,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
     layout = _Layout.of(accumulated_bar)
-    fields = layout.channels * layout.coeffs
+    fields = layout.fields
     steps = _Steps(layout, factors, transmittance, offsets, axis, weights, lobes, clamp, occlude_first_step)
-    total_bar = layout.pad(accumulated_bar)
-    after, spare = total_bar.clone(), layout.empty(fields, accumulated_bar)
+    total_bar, volume_bar = layout.pad(accumulated_bar), layout.empty(fields, accumulated_bar)
     lobe_bar = layout.empty(layout.channels * len(lobes), accumulated_bar)
-    factor_bar = accumulated_bar.new_zeros(len(factors) * layout.rows)
+    lobe_bar_next = torch.zeros_like(lobe_bar)
+    factor_bar = accumulated_bar.new_zeros(len(factors) * layout.rows if need_factors else 0)
     faces = len(transmittance) if need_transmittance else 0
     transmittance_bar = layout.empty(faces, accumulated_bar) if faces else accumulated_bar.new_empty(0)
     segment = [layout.empty(fields, accumulated_bar) for _ in range(min(keep, len(factors)) - 1)] if keep else []
-    unused = layout.empty(fields, accumulated_bar) if segment else spare
+    unused = layout.empty(fields, accumulated_bar) if segment else volume_bar
     count = int(done)
-    for begin in reversed(range(0, count, keep or max(count, 1))):
-        end = min(begin + keep, count) if keep else count
-        volumes: list[torch.Tensor | None] = [None] * (end - begin)
-        if keep:
-            volumes = [states[begin // keep], *segment[: end - begin - 1]]
-            for i in range(end - begin - 1):
-                steps.forward(volumes[i], volumes[i + 1], unused, begin + i)  # type: ignore[arg-type]
+    if count == 0:
+        volume_bar = total_bar
+    else:
+        none = accumulated_bar.new_empty(0)
+        steps.adjoint(total_bar, lobe_bar_next, lobe_bar, total_bar, volume_bar, none, none, count, start=True)
+    for begin in reversed(range(0, count, keep or count or 1)):
+        end = min(begin + (keep or count), count)
+        volumes = [states[begin // keep], *segment] if keep else [total_bar] * count
+        for i in range(end - begin - 1 if keep else 0):
+            steps.forward(volumes[i], volumes[i + 1], unused, begin + i)
         for step in reversed(range(begin, end)):
             steps.adjoint(
-                volumes[step - begin], after, lobe_bar, total_bar, spare, transmittance_bar, factor_bar, step
+                volumes[step - begin], lobe_bar, lobe_bar_next, total_bar, volume_bar, transmittance_bar, factor_bar, step
             )
-            after, spare = spare, after
-    volume_bar = layout.inside(after, fields).reshape(accumulated_bar.shape).contiguous()
+            lobe_bar, lobe_bar_next = lobe_bar_next, lobe_bar
+    volume_bar = layout.inside(volume_bar, fields).reshape(accumulated_bar.shape).contiguous()
     if faces:
         transmittance_bar = layout.inside(transmittance_bar, faces).contiguous()
-    return volume_bar, factor_bar.view(len(factors), layout.rows).sum(1), transmittance_bar
+    if need_factors:
+        factor_bar = factor_bar.view(len(factors), layout.rows).sum(1)
+    return volume_bar, factor_bar, transmittance_bar
 
 
 @_propagate_backward.register_fake
-def _(  # type: ignore[no-untyped-def]
+def _(
     accumulated_bar, states, done, factors, transmittance, offsets, axis, weights, lobes, clamp, occlude_first_step, keep,
-    need_transmittance,
+    need_factors, need_transmittance,
 ):  # fmt: skip
     passed = torch.empty_like(transmittance) if need_transmittance else accumulated_bar.new_empty(0)
-    return torch.empty_like(accumulated_bar), torch.empty_like(factors), passed
+    return torch.empty_like(accumulated_bar), accumulated_bar.new_empty(len(factors) if need_factors else 0), passed
 
 
 refuse_second_derivative("propagate", _propagate_backward)
@@ -258,8 +277,9 @@ def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[torch.Tensor, ...]) 
 def _backward(ctx: Any, accumulated_bar: torch.Tensor, *unused: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
     need_volume, need_factors, need_transmittance = ctx.needs_input_grad[:3]
     volume_bar, factor_bar, transmittance_bar = _propagate_backward(
-        accumulated_bar.contiguous(), *ctx.saved_tensors, ctx.clamp, ctx.occlude_first_step, ctx.keep, need_transmittance
-    )
+        accumulated_bar.contiguous(), *ctx.saved_tensors, ctx.clamp, ctx.occlude_first_step, ctx.keep, need_factors,
+        need_transmittance,
+    )  # fmt: skip
     return (
         volume_bar if need_volume else None,
         factor_bar if need_factors else None,
@@ -288,10 +308,11 @@ def propagate_faces(
     needs = learned or (clamp and torch.is_grad_enabled() and volume.requires_grad)
     keep = 0
     if needs and len(factors):
-        bytes_a_step = _Layout.of(volume).length(volume.shape[0] * volume.shape[1]) * volume.element_size()
+        layout = _Layout.of(volume)
+        bytes_a_step = layout.length(layout.fields) * volume.element_size()
         every = 1 if len(factors) * bytes_a_step <= _KEEP_ALL_BYTES else math.isqrt(len(factors))
         keep = checkpoint_every or every
-    lobes, axis = np.unique(stencil.lobes, axis=0, return_inverse=True)
+    lobes, axis = stencil.distinct_lobes
 
     def tensor(values: np.ndarray) -> torch.Tensor:
         return torch.as_tensor(values, dtype=volume.dtype, device=volume.device)
@@ -301,7 +322,7 @@ def propagate_faces(
         factors.contiguous(),
         passed.contiguous(),
         torch.as_tensor(stencil.offsets, device=volume.device),
-        torch.as_tensor(axis.ravel(), device=volume.device),
+        torch.as_tensor(axis, device=volume.device),
         tensor(stencil.flux_weights),
         tensor(lobes),
         clamp,

@@ -96,7 +96,7 @@ def propagate(
     if backend == "conv3d" and not plain:
         raise ValueError("backend: conv3d has neither clamp nor occlusion; use 'auto' or 'warp'")
     if backend == "conv3d" or (backend == "auto" and plain and volume.device.type == "cpu"):
-        return _linear(volume, stencil.linear(), None, factors, tolerance)
+        return _linear(volume, stencil.linear_part, None, factors, tolerance)
     return propagate_faces(
         volume,
         stencil,

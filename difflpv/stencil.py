@@ -14,14 +14,22 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Literal
 
 import numpy as np
 
 from difflpv.sh import coeff_count, cosine_lobe, degree_of_count, sh_basis
 
-__all__ = ["FaceStencil", "LinearStencil", "Normalization", "Reprojection", "holpv_stencil", "lpv_stencil", "square_solid_angle"]
+__all__ = [
+    "FaceStencil",
+    "LinearStencil",
+    "Normalization",
+    "Reprojection",
+    "holpv_stencil",
+    "lpv_stencil",
+    "square_solid_angle",
+]
 
 Normalization = Literal["energy", "thesis"]
 Reprojection = Literal["face", "ray"]
@@ -90,22 +98,30 @@ class FaceStencil:
     def __post_init__(self) -> None:
         for name in ("offsets", "directions", "lobe_axes"):
             rows = np.asarray(getattr(self, name))
-            if rows.shape != (len(self.offsets), 3) or not np.allclose(rows[0::2], -rows[1::2]):
+            paired = rows.shape == (len(self.offsets), 3) and len(rows) % 2 == 0 and np.allclose(rows[0::2], -rows[1::2])
+            if not paired:
                 raise ValueError(f"{name}: expected shape [F, 3] in antipodal pairs, got shape {list(rows.shape)}")
 
-    @property
+    @cached_property
     def flux_weights(self) -> np.ndarray:
         """Coefficients -> face flux [W]: Omega_f Y(w_f) (energy) or Omega_f/(4 pi) Y(w_f) (thesis), shape [F,K]."""
         scale = 1.0 if self.normalization == "energy" else 0.25 / math.pi
         return scale * self.solid_angles[:, None] * sh_basis(self.directions, self.l_max)
 
-    @property
+    @cached_property
     def lobes(self) -> np.ndarray:
         """Face flux -> coefficients [1/sr]: lobe(axis)/pi (energy) or lobe(axis) (thesis), shape [F,K]."""
         scale = 1.0 / math.pi if self.normalization == "energy" else 1.0
         return scale * cosine_lobe(self.lobe_axes, self.l_max)
 
-    def linear(self) -> LinearStencil:
+    @cached_property
+    def distinct_lobes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Distinct rows of ``lobes`` [A,K] and the row of each face [F]: fluxes are summed per lobe before they meet it."""
+        rows, index = np.unique(self.lobes, axis=0, return_inverse=True)
+        return rows, index.ravel()
+
+    @cached_property
+    def linear_part(self) -> LinearStencil:
         """The stencil without the clamp: one matrix per neighbour."""
         products = self.lobes[:, :, None] * self.flux_weights[:, None, :]
         offsets, index = np.unique(self.offsets, axis=0, return_inverse=True)
@@ -129,7 +145,11 @@ def square_solid_angle(center: np.ndarray, axis: int) -> float:
 
 
 def _faces(
-    name: str, l_max: int, relevant: Callable[[np.ndarray, int, int], bool], normalization: Normalization, reprojection: Reprojection
+    name: str,
+    l_max: int,
+    relevant: Callable[[np.ndarray, int, int], bool],
+    normalization: Normalization,
+    reprojection: Reprojection,
 ) -> FaceStencil:
     if normalization not in ("energy", "thesis"):
         raise ValueError(f"normalization: expected 'energy' or 'thesis', got {normalization!r}")

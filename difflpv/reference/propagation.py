@@ -10,12 +10,13 @@ __all__ = ["propagate_faces", "propagate_linear", "shift_cells"]
 def shift_cells(field: torch.Tensor, offset: tuple[int, int, int]) -> torch.Tensor:
     """Move a field [..., n_z, n_y, n_x] by a cell offset (x, y, z); what leaves the grid is lost."""
     moved = torch.zeros_like(field)
-    into, out_of = [], []
+    into: list[slice] = []
+    out_of: list[slice] = []
     for axis, step in zip((-3, -2, -1), reversed(offset), strict=True):
         size = field.shape[axis]
         into.append(slice(max(step, 0), size + min(step, 0)))
         out_of.append(slice(max(-step, 0), size + min(-step, 0)))
-    moved[(..., *into)] = field[(..., *out_of)]
+    moved[..., into[0], into[1], into[2]] = field[..., out_of[0], out_of[1], out_of[2]]
     return moved
 
 
