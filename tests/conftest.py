@@ -27,6 +27,16 @@ def relative_tolerance():
 
 
 @pytest.fixture
+def cuda():
+    """The CUDA device, for tests marked ``gpu``."""
+    import torch
+
+    if not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    return torch.device("cuda")
+
+
+@pytest.fixture
 def check_op():
     """Everything that a stage's function promises beyond its values, for a ``function`` of tensors with one result."""
     return check_differentiable_op

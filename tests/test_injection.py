@@ -37,9 +37,7 @@ def test_equals_twin(generator, dtype, relative_tolerance, deposit, l_max):
     vpls = random_vpls(generator, dtype, margin=0.7)
     volume, report = inject(vpls, GRID, l_max=l_max, deposit=deposit)
     fields = (vpls.position, vpls.normal, vpls.flux)
-    expected = twin.inject(
-        *fields, GRID.minimum, GRID.cell_size, GRID.resolution, l_max=l_max, deposit=deposit, bias=0.5
-    )
+    expected = twin.inject(*fields, GRID.minimum, GRID.cell_size, GRID.resolution, l_max=l_max, deposit=deposit, bias=0.5)
     assert volume.shape == (3, (l_max + 1) ** 2, *GRID.shape)
     assert 0 < int(report.lost_count) < len(vpls)
     tolerance = relative_tolerance(dtype) * float(expected.abs().max())
@@ -94,9 +92,7 @@ def test_trilinear_splits_between_two_cells():
 
 @pytest.mark.parametrize("deposit", DEPOSITS)
 @settings(max_examples=30, deadline=None)
-@given(
-    share=hnp.arrays("float64", (7, 3), elements=st.floats(0, 1, exclude_max=True)), l_max=st.sampled_from([1, 2, 3])
-)
+@given(share=hnp.arrays("float64", (7, 3), elements=st.floats(0, 1, exclude_max=True)), l_max=st.sampled_from([1, 2, 3]))
 def test_flux_is_conserved_for_every_position_inside(deposit, share, l_max):
     size = torch.tensor(GRID.resolution, dtype=torch.float64)
     cells = (torch.from_numpy(share) * size).clamp(max=size - 1e-9)
@@ -148,9 +144,7 @@ def test_non_contiguous_input(generator, dtype, deposit):
     vpls = random_vpls(generator, dtype)
     strided = Vpls(*(t.t().contiguous().t() for t in (vpls.position, vpls.normal, vpls.flux)))
     assert not strided.position.is_contiguous()
-    assert torch.equal(
-        inject(vpls, GRID, l_max=2, deposit=deposit)[0], inject(strided, GRID, l_max=2, deposit=deposit)[0]
-    )
+    assert torch.equal(inject(vpls, GRID, l_max=2, deposit=deposit)[0], inject(strided, GRID, l_max=2, deposit=deposit)[0])
 
 
 def test_promises_of_a_differentiable_op(generator, check_op):
@@ -253,9 +247,21 @@ def test_errors(call, error, message):
 def test_nan_position_inside_a_compiled_graph_is_lost():
     # torch.compile skips the check above; the kernel has to stay inside its arrays and the report has to tell.
     torch._dynamo.reset()
-    compiled = torch.compile(
-        lambda p: inject(Vpls(p, V.normal, V.flux), GRID, l_max=1), fullgraph=True, backend="aot_eager"
-    )
+    compiled = torch.compile(lambda p: inject(Vpls(p, V.normal, V.flux), GRID, l_max=1), fullgraph=True, backend="aot_eager")
     volume, report = compiled(with_value(V.position, 2, math.nan))
     assert int(report.lost_count) >= 1
     assert torch.isfinite(volume).all()
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("deposit", DEPOSITS)
+def test_cuda_equals_cpu(cuda, generator, dtype, relative_tolerance, deposit):
+    vpls = random_vpls(generator, dtype, count=1000, margin=0.7)
+    results = []
+    for device in (torch.device("cpu"), cuda):
+        inputs = [t.to(device).requires_grad_() for t in (vpls.position, vpls.normal, vpls.flux)]
+        volume, report = inject(Vpls(*inputs), GRID, l_max=2, deposit=deposit)
+        gradients = torch.autograd.grad(volume.square().sum(), inputs if deposit == "trilinear" else inputs[1:])
+        results.append([t.detach().cpu() for t in (volume, *gradients, report.lost_count, report.lost_share)])
+    for a, b in zip(*results, strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=10 * relative_tolerance(dtype) * max(1.0, float(a.abs().max())))

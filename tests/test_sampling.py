@@ -247,3 +247,18 @@ def test_nan_position_inside_a_compiled_graph_gives_nan(dtype):
     result = compiled(NAN.to(dtype))
     assert torch.isnan(result[1]).all()
     assert torch.isfinite(result[[0, 2]]).all()
+
+
+@pytest.mark.gpu
+def test_cuda_equals_cpu(cuda, generator, dtype, relative_tolerance):
+    inputs = (random_volume(generator, dtype), *random_receivers(generator, dtype, count=1000))
+    results = []
+    for device in (torch.device("cpu"), cuda):
+        volume, positions, normals = (t.to(device).requires_grad_() for t in inputs)
+        irradiance = sample_irradiance(volume, positions, normals, GRID)
+        coeffs = sample_coeffs(volume, positions, GRID)
+        total = irradiance.square().sum() + coeffs.square().sum()
+        gradients = torch.autograd.grad(total, (volume, positions, normals))
+        results.append([t.detach().cpu() for t in (irradiance, coeffs, *gradients)])
+    for a, b in zip(*results, strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=10 * relative_tolerance(dtype) * float(a.abs().max()))
