@@ -2,6 +2,8 @@
 # later runs install nothing until pyproject.toml, constraints.txt, the Python or the checkout's place changes.
 
 PYTHON ?= python3
+# Two processes with one torch thread each beat one process with two threads; 0 runs all tests in one process (for pdb).
+WORKERS ?= 2
 PYTEST_ARGS ?=
 VENV := .venv
 RUN := $(VENV)/bin/python
@@ -46,14 +48,14 @@ demo: $(STAMP)
 	$(RUN) -m difflpv.cli demo --out out/demo
 
 test: $(STAMP)
-	$(RUN) -m pytest $(PYTEST_ARGS)
+	OMP_NUM_THREADS=1 $(RUN) -m pytest -n $(WORKERS) --dist loadfile $(PYTEST_ARGS)
 
 lint: $(STAMP)
 	$(RUN) -m ruff check .
 	$(RUN) -m mypy
 
 bench: $(STAMP)
-	@set -e; for program in benchmarks/bench_*.py; do echo "== $$program"; $(RUN) "$$program"; done
+	@set -e; for program in benchmarks/*.py; do echo "== $$program"; $(RUN) "$$program"; done
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

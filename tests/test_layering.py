@@ -247,20 +247,6 @@ def test_no_import_cycle():
     graphlib.TopologicalSorter(graph).prepare()  # raises CycleError, which names the cycle
 
 
-def generated_adjoints(source: str) -> list[str]:
-    """Kernels that leave Warp's generated adjoint on."""
-    functions = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.FunctionDef)]
-    decorators = [(f.name, ast.unparse(d)) for f in functions for d in f.decorator_list]
-    return [name for name, text in decorators if text.startswith("wp.kernel") and "enable_backward=False" not in text]
-
-
-def test_no_kernel_relies_on_the_generated_adjoint():
-    # It is slow, and silently wrong for ordinary patterns: `while`, `v[i] = v[i] + x`, values used after a loop.
-    assert generated_adjoints("@wp.kernel\ndef careless(): ...") == ["careless"]
-    found = {m: names for m, path in MODULES.items() if (names := generated_adjoints(path.read_text()))}
-    assert not found, f"write '@wp.kernel(enable_backward=False)' and the adjoint by hand: {found}"
-
-
 def test_layers_list_no_module_twice():
     names = [name for _, names in LAYERS for name in names]
     assert len(names) == len(set(names))
