@@ -158,6 +158,15 @@ class Parameter:
             return -_softplus_inverse((self.upper - value) / self._scale)
         return value / self._scale
 
+    def nudge_inside(self, value: Tensor) -> Tensor:
+        """A physical value moved off its bounds by a millionth of the interval (or of 1), so that ``to_raw`` takes it.
+
+        For starting from a solver that reaches bounds exactly.
+        """
+        value = self._checked("value", value)
+        margin = 1e-6 * torch.where((self.upper - self.lower).isfinite(), self.upper - self.lower, torch.ones_like(value))
+        return value.clamp(self.lower + margin, self.upper - margin)
+
     def _checked(self, argument: str, values: Tensor) -> Tensor:
         if not isinstance(values, Tensor) or values.dtype != torch.float64:
             got = values.dtype if isinstance(values, Tensor) else type(values).__name__

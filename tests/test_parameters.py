@@ -136,3 +136,12 @@ def test_bad_name_and_bad_values():
         p.to_physical(torch.zeros(2, dtype=torch.float64))
     with pytest.raises(TypeError, match="raw must be a float64 tensor, got torch.float32"):
         p.to_physical(torch.zeros(1))
+
+
+def test_a_value_on_its_bound_can_be_nudged_inside():
+    parameter = Parameter("p", [0.5, 0.5, 0.5], lower=0.0, upper=2.0)
+    nudged = parameter.nudge_inside(torch.tensor([0.0, 2.0, 1.25], dtype=torch.float64))
+    assert nudged.tolist() == pytest.approx([2e-6, 2 - 2e-6, 1.25], rel=1e-12)
+    torch.testing.assert_close(parameter.to_physical(parameter.to_raw(nudged)), nudged)
+    free = Parameter("q", 0.0)
+    assert free.nudge_inside(torch.tensor(3.0, dtype=torch.float64)).item() == 3.0

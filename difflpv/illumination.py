@@ -1,0 +1,227 @@
+"""A scene under its lights, ready to solve: everything that rays decide, computed once and held fixed.
+
+What moves or scales with a learnable (light power and position, albedo) is applied per solve by ``Illumination.vpls``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+
+from difflpv.config import LpvConfig
+from difflpv.direct import (
+    Emitters,
+    area_light_vpls,
+    direct_irradiance,
+    drop_unlit,
+    emitters_of,
+    lit_surface_vpls,
+    visibility,
+)
+from difflpv.grid import Grid
+from difflpv.occlusion import Blockers, blocking_potential, geometry_volume
+from difflpv.raycast import Raycaster
+from difflpv.rsm import Rsm, render_rsm, rsm_blockers, rsm_vpls
+from difflpv.scene import AreaLight, Scene
+from difflpv.surface import SurfaceSamples, sample_surfaces
+from difflpv.vpl import Vpls
+
+__all__ = ["Component", "Illumination", "LightValues", "Receivers", "illuminate"]
+
+Component = Literal["direct", "bounce1"]
+
+
+@dataclass(frozen=True, eq=False)
+class LightValues:
+    """Learnables of lights and surfaces; None leaves the scene's own.
+
+    Attributes:
+        intensity: factor per light, [lights].
+        color: factor per light and channel, [lights,3].
+        position: displacement per light [m], [lights,3].
+        albedo: untextured albedo per mesh, [meshes,3].
+    """
+
+    intensity: torch.Tensor | None = None
+    color: torch.Tensor | None = None
+    position: torch.Tensor | None = None
+    albedo: torch.Tensor | None = None
+
+    def __bool__(self) -> bool:
+        """True if anything is given."""
+        return any(v is not None for v in (self.intensity, self.color, self.position, self.albedo))
+
+    def scale(self) -> torch.Tensor | None:
+        """Factor on each light's power, [lights,3], or None."""
+        if self.intensity is None or self.color is None:
+            return self.color if self.intensity is None else self.intensity[:, None].expand(-1, 3)
+        return self.intensity[:, None] * self.color
+
+
+@dataclass(frozen=True, eq=False)
+class Receivers:
+    """Points that ask for irradiance.
+
+    Attributes:
+        position: [n,3] m.
+        normal: unit normals on the free side, [n,3].
+        visible: which point, spot and directional light each sees, uint8 [n,m] (component "direct" only).
+    """
+
+    position: torch.Tensor
+    normal: torch.Tensor
+    visible: torch.Tensor | None = None
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+
+@dataclass(frozen=True, eq=False)
+class Illumination:
+    """One scene under one set of lights, for one component; see ``illuminate``.
+
+    Attributes:
+        component: "direct" or "bounce1".
+        scene: with its lights.
+        grid: cells of the volume.
+        emitters: all lights (area lights as samples of their surface).
+        samples: lit surface samples that start the bounce of area lights, or None.
+        visible: which emitter each sample sees, uint8.
+        rsms: one per point, spot or directional light (component "bounce1").
+        potential: blocking potential [F, n_z, n_y, n_x] of the configuration's stencil, or None.
+        raycaster: over the scene.
+    """
+
+    component: Component
+    scene: Scene
+    grid: Grid
+    emitters: Emitters
+    samples: SurfaceSamples | None
+    visible: torch.Tensor | None
+    rsms: tuple[Rsm, ...]
+    potential: torch.Tensor | None
+    raycaster: Raycaster
+
+    def _punctual(self) -> torch.Tensor:
+        area = torch.tensor([isinstance(light, AreaLight) for light in self.scene.lights], device=self.emitters.kind.device)
+        return ~area[self.emitters.light_index]
+
+    def vpls(self, values: LightValues | None = None) -> Vpls:
+        """All virtual point lights of the component; empty where no light needs the volume."""
+        return self._scene_vpls if not values else self._shade(values)
+
+    @cached_property
+    def _scene_vpls(self) -> Vpls:
+        with torch.no_grad():
+            return self._shade(LightValues())
+
+    def _shade(self, values: LightValues) -> Vpls:
+        emitters = self.emitters.adjusted(scale=values.scale(), offset=values.position)
+        punctual = self._punctual()
+        if self.component == "direct":
+            return area_light_vpls(emitters.select(~punctual))
+        parts = [self._rsm_vpls(rsm, emitters, values) for rsm in self.rsms]
+        if self.samples is not None and self.visible is not None:
+            area = emitters.select(~punctual)
+            albedo = None if values.albedo is None else self.samples.albedo_from(values.albedo)
+            parts.append(lit_surface_vpls(self.samples, area, self.visible, albedo=albedo))
+        return Vpls.cat(parts)
+
+    def _rsm_vpls(self, rsm: Rsm, emitters: Emitters, values: LightValues) -> Vpls:
+        light = int((emitters.light_index == rsm.light_index).nonzero()[0])
+        albedo = None if values.albedo is None else rsm.albedo_from(values.albedo)
+        return rsm_vpls(rsm, emitters.position[light], emitters.power[light], albedo=albedo)
+
+    def receivers(self, position: np.ndarray | torch.Tensor, normal: np.ndarray | torch.Tensor) -> Receivers:
+        """Receivers [n,3], [n,3], with the shadow rays that the direct part of punctual lights needs."""
+        like = self.emitters.position
+        x = torch.as_tensor(np.asarray(position), dtype=like.dtype, device=like.device)
+        n = torch.as_tensor(np.asarray(normal), dtype=like.dtype, device=like.device)
+        punctual = self._punctual()
+        if self.component != "direct" or not bool(punctual.any()):
+            return Receivers(x, n)
+        return Receivers(x, n, visibility(x, n, self.emitters.select(punctual), self.raycaster))
+
+    def punctual_irradiance(self, receivers: Receivers, values: LightValues | None = None) -> torch.Tensor | None:
+        """Direct irradiance [n,3] W/m2 of point, spot and directional lights by shadow rays; None where there is none."""
+        if receivers.visible is None:
+            return None
+        values = values or LightValues()
+        lights = self.emitters.adjusted(scale=values.scale(), offset=values.position).select(self._punctual())
+        return direct_irradiance(receivers.position, receivers.normal, lights, receivers.visible)
+
+
+def illuminate(
+    scene: Scene,
+    grid: Grid,
+    config: LpvConfig,
+    component: Component = "bounce1",
+    *,
+    surface_samples: int = 8192,
+    area_samples: int = 256,
+    rsm_resolution: int = 64,
+    blockers: Literal["surface", "rsm"] = "surface",
+    seed: int = 0,
+    dtype: torch.dtype = torch.float32,
+    device: torch.device | str = "cpu",
+) -> Illumination:
+    """Trace what a solve needs of a scene, once.
+
+    Args:
+        scene: with the lights to solve for (``difflpv.lights.apply_light_set``).
+        grid: cells of the volume.
+        config: decides the stencil and whether geometry blocks.
+        component: "direct": area lights are VPLs and the volume carries their direct light, punctual lights are exact;
+            "bounce1": VPLs on lit surfaces, an RSM per punctual light, surface samples for area lights.
+        surface_samples: surface points (each with two sides) that carry the bounce and block light.
+        area_samples: samples per area light.
+        rsm_resolution: texels along an edge of an RSM face.
+        blockers: what fills the geometry volume: all surfaces by area, or only what the RSMs see (the publications).
+        seed: of all samples.
+        dtype: float32 to run, float64 to check gradients.
+        device: where the solve runs.
+
+    Raises:
+        ValueError: an unknown choice, or ``blockers="rsm"`` where no light has an RSM.
+    """
+    if component not in get_args(Component):
+        raise ValueError(f"component: expected 'direct' or 'bounce1', got {component!r}")
+    if blockers not in ("surface", "rsm"):
+        raise ValueError(f"blockers: expected 'surface' or 'rsm', got {blockers!r}")
+    raycaster = Raycaster(scene)
+    emitters = emitters_of(scene, area_samples=area_samples, seed=seed, dtype=dtype, device=device)
+    samples, visible, rsms = None, None, ()
+    has_area = any(isinstance(light, AreaLight) for light in scene.lights)
+    if component == "bounce1" and has_area:
+        area = torch.tensor([isinstance(light, AreaLight) for light in scene.lights], device=emitters.kind.device)
+        lit = sample_surfaces(scene, surface_samples, seed=seed, dtype=dtype, device=device)
+        of_area = emitters.select(area[emitters.light_index])
+        samples, visible = drop_unlit(lit, visibility(lit.position, lit.normal, of_area, raycaster))
+    if component == "bounce1" or (blockers == "rsm" and config.occlusion != "none"):
+        rsms = tuple(
+            render_rsm(scene, k, raycaster, resolution=rsm_resolution, dtype=dtype, device=device)
+            for k, light in enumerate(scene.lights)
+            if not isinstance(light, AreaLight)
+        )
+    potential = None
+    if config.occlusion != "none":
+        if blockers == "rsm" and not rsms:
+            raise ValueError("blockers: 'rsm' needs a point, spot or directional light; use 'surface'")
+        if blockers == "rsm":
+            parts = [Blockers(*rsm_blockers(rsm)) for rsm in rsms]
+            surfels = Blockers(*(torch.cat([getattr(p, name) for p in parts]) for name in ("position", "normal", "area")))
+        else:
+            s = sample_surfaces(
+                scene, surface_samples, seed=seed, dtype=dtype, device=device, both_sides=False, include_lights=True
+            )
+            surfels = Blockers(s.position, s.normal, s.area)
+        stencil = config.stencil
+        corners = geometry_volume(surfels, grid, l_max=stencil.l_max, two_sided=blockers == "surface")
+        potential = blocking_potential(corners, stencil.offsets, stencil.directions)
+    if component == "direct":
+        rsms = ()
+    return Illumination(component, scene, grid, emitters, samples, visible, rsms, potential, raycaster)

@@ -1,0 +1,103 @@
+"""Predict irradiance and images of a scene: a solve from end to end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from difflpv.camera_view import camera_view
+from difflpv.config import LpvConfig
+from difflpv.grid import Grid
+from difflpv.illumination import Component, Illumination, illuminate
+from difflpv.pipeline import Lpv
+from difflpv.scene import Camera, Scene
+
+__all__ = ["Prediction", "render", "simulate", "solve_irradiance"]
+
+_RECEIVERS_PER_CHUNK = 1 << 18
+_LOST_SHARE_TOLD = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Irradiance [n,3] W/m2 and what the user should be told about it, a line each."""
+
+    irradiance: np.ndarray
+    warnings: tuple[str, ...] = ()
+
+
+@torch.no_grad()
+def solve_irradiance(lpv: Lpv, light: Illumination, position: np.ndarray, normal: np.ndarray) -> Prediction:
+    """Irradiance of receivers [n,3] m with unit normals [n,3], without gradients, whatever their number.
+
+    Raises:
+        FloatingPointError: the result is not finite.
+    """
+    parts = []
+    for begin in range(0, max(len(position), 1), _RECEIVERS_PER_CHUNK):
+        rows = slice(begin, begin + _RECEIVERS_PER_CHUNK)
+        parts.append(lpv(light, light.receivers(position[rows], normal[rows])).cpu().numpy())
+    return Prediction(np.concatenate(parts).astype(np.float64), _told(lpv, light, position))
+
+
+def _told(lpv: Lpv, light: Illumination, position: np.ndarray) -> tuple[str, ...]:
+    lines = []
+    if lpv.report is not None and float(lpv.report.lost_share) > _LOST_SHARE_TOLD:
+        lines.append(
+            f"the grid {lpv.grid.minimum}..{lpv.grid.maximum} m does not contain the scene: "
+            f"{int(lpv.report.lost_count)} VPLs with {100 * float(lpv.report.lost_share):.3g} % of the flux are lost"
+        )
+    outside = int((~lpv.grid.contains(position)).sum())
+    if outside:
+        lines.append(f"{outside} of {len(position)} receivers lie outside the grid and read its edge cells")
+    return tuple(lines)
+
+
+def simulate(
+    scene: Scene,
+    position: np.ndarray,
+    normal: np.ndarray,
+    *,
+    grid: Grid,
+    config: LpvConfig | None = None,
+    component: Component = "bounce1",
+    lpv: Lpv | None = None,
+    seed: int = 0,
+    device: torch.device | str = "cpu",
+) -> Prediction:
+    """Irradiance of receivers by a volume solve.
+
+    Args:
+        scene: with the lights to solve for.
+        position: receivers [n,3] m.
+        normal: unit normals [n,3] on the free side.
+        grid: cells of the volume (``difflpv.config.grid_for``).
+        config: the solve; HOLPV as published by default. Ignored where ``lpv`` is given.
+        component: "direct" or "bounce1" (see ``difflpv.illumination.illuminate``).
+        lpv: a fitted model on the same grid.
+        seed: of the light samples.
+        device: where to solve.
+
+    Raises:
+        ValueError: a grid or component that does not fit.
+        FloatingPointError: the result is not finite.
+    """
+    model = lpv or Lpv(grid, config)
+    light = illuminate(scene, grid, model.config, component, seed=seed, device=device)
+    return solve_irradiance(model, light, np.asarray(position), np.asarray(normal))
+
+
+def render(lpv: Lpv, light: Illumination, camera: Camera | None = None) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Image from a camera: radiance albedo E / pi [H,W,3], lights showing their own in component "direct".
+
+    Raises:
+        SceneError: the scene has no camera.
+        FloatingPointError: the result is not finite.
+    """
+    view = camera_view(light.scene, light.raycaster, camera)
+    if not len(view.hit):
+        return view.image(np.zeros((0, 3))), ("the camera sees no surface",)
+    prediction = solve_irradiance(lpv, light, view.position, view.normal)
+    return view.image(prediction.irradiance, emission=light.component == "direct"), prediction.warnings
