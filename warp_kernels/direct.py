@@ -16,7 +16,8 @@ Adjoint, g_i the adjoint of E_i:
 
     Pbar_j = sum_i V_ij G_ij g_i,    pbar_j = sum_i V_ij (dG_ij/dp_j) (P_j . g_i)
 
-Shapes (a tensor [n,3] is read as n vectors): points, normals [n,3]; position, direction, power [m,3]; cone (cos inner, cos outer) [m,2]; visibility [n,m].
+Shapes, a tensor [n,3] being read as n vectors: points, normals [n,3]; position, direction, power [m,3]; cone (cos
+inner, cos outer) [m,2]; visibility [n,m].
 Threads: forward, one per receiver, with a loop over emitters. Adjoint, one per (block of receivers, emitter): it
 gathers over its block and writes its own row of a partial sum [blocks, m], so there are no atomics and the result is
 deterministic.

@@ -14,9 +14,9 @@ Adjoint, with the adjoints xbar, Phibar:
     pbar   = sum_t xbar_t - n_t (d_t.xbar_t) / (n_t.d_t)
     Pbar   = sum_t w_t rho_t Phibar_t,    rhobar_t = w_t P Phibar_t
 
-Shapes (a tensor [n,3] is read as n vectors): offset, direction, normal, albedo [t,3]; plane, weight [t]; position, power [1,3]. Threads: forward, one per
-texel. Adjoint, one per block of texels: it writes its texels' rhobar and its own row of the partial sums of pbar and
-Pbar, so there are no atomics and the result is deterministic.
+Shapes, a tensor [t,3] being read as t vectors: offset, direction, normal, albedo [t,3]; plane, weight [t]; position,
+power [3], one vector each. Threads: forward, one per texel. Adjoint, one per block of texels: it writes its texels'
+rhobar and its own row of the partial sums of pbar and Pbar, so there are no atomics and the result is deterministic.
 """
 
 # mypy: disable-error-code="valid-type"
