@@ -66,6 +66,8 @@ def draw_probes(
         found = np.concatenate([found, points])
         if len(found) >= count:
             return found[:count]
+        if attempt == 7 and not len(found):
+            break
     raise ValueError(f"scene '{scene.name}': hardly any free space, found {len(found)} of {count} probes")
 
 

@@ -21,7 +21,7 @@ __all__ = ["MAX_SAMPLES", "SOBOL_DIMENSIONS", "SampleStream", "generator", "sobo
 SOBOL_DIMENSIONS = 16
 MAX_SAMPLES = 2**16
 # (degree s, coefficients a, initial m_1..m_s) of dimensions 2 to 16; scipy has them, but takes a second to import
-_PRIMITIVE = (
+_PRIMITIVE: tuple[tuple[int, int, tuple[int, ...]], ...] = (
     (1, 0, (1,)),
     (2, 1, (1, 3)),
     (3, 1, (1, 3, 1)),
@@ -44,7 +44,8 @@ def generator(seed: int, *address: int) -> np.random.Generator:
     """Philox generator of the stream ``(seed, *address)``, all non-negative integers."""
     if seed < 0:
         raise ValueError(f"seed: expected an integer >= 0, got {seed}")
-    return np.random.Generator(np.random.Philox(np.random.SeedSequence([int(seed), *map(int, address)])))
+    sequence = np.random.SeedSequence(int(seed), spawn_key=tuple(int(part) for part in address))
+    return np.random.Generator(np.random.Philox(sequence))
 
 
 def _direction_integers(degree: int, coefficients: int, initial: tuple[int, ...], count: int) -> list[int]:
