@@ -25,7 +25,7 @@ from difflpv.direct import (
 from difflpv.grid import Grid
 from difflpv.occlusion import Blockers, blocking_potential, geometry_volume
 from difflpv.raycast import Raycaster
-from difflpv.rsm import Rsm, render_rsm, rsm_blockers, rsm_vpls
+from difflpv.rsm import Rsm, TexelFlux, render_rsm, rsm_blockers, rsm_vpls
 from difflpv.scene import AreaLight, Scene
 from difflpv.surface import SurfaceSamples, sample_surfaces
 from difflpv.vpl import Vpls
@@ -134,7 +134,8 @@ class Illumination:
     def _rsm_vpls(self, rsm: Rsm, emitters: Emitters, values: LightValues) -> Vpls:
         light = int((emitters.light_index == rsm.light_index).nonzero()[0])
         albedo = None if values.albedo is None else rsm.albedo_from(values.albedo)
-        return rsm_vpls(rsm, emitters.position[light], emitters.power[light], albedo=albedo)
+        position = None if rsm.light == "directional" else emitters.position[light]
+        return rsm_vpls(rsm, position=position, power=emitters.power[light], albedo=albedo)
 
     def receivers(self, position: np.ndarray | torch.Tensor, normal: np.ndarray | torch.Tensor) -> Receivers:
         """Receivers [n,3], [n,3], with the shadow rays that the direct part of punctual lights needs."""
@@ -163,7 +164,8 @@ def illuminate(
     *,
     surface_samples: int = 8192,
     area_samples: int = 256,
-    rsm_resolution: int = 64,
+    rsm_resolution: int = 128,
+    texel_flux: TexelFlux = "exact",
     blockers: Literal["surface", "rsm"] = "surface",
     seed: int = 0,
     dtype: torch.dtype = torch.float32,
@@ -180,6 +182,7 @@ def illuminate(
         surface_samples: surface points (each with two sides) that carry the bounce and block light.
         area_samples: samples per area light.
         rsm_resolution: texels along an edge of an RSM face.
+        texel_flux: what a texel receives, see ``difflpv.rsm.render_rsm``.
         blockers: what fills the geometry volume: all surfaces by area, or only what the RSMs see (the publications).
         seed: of all samples.
         dtype: float32 to run, float64 to check gradients.
@@ -194,7 +197,8 @@ def illuminate(
         raise ValueError(f"blockers: expected 'surface' or 'rsm', got {blockers!r}")
     raycaster = Raycaster(scene)
     emitters = emitters_of(scene, area_samples=area_samples, seed=seed, dtype=dtype, device=device)
-    samples, visible, rsms = None, None, ()
+    samples, visible = None, None
+    rsms: tuple[Rsm, ...] = ()
     has_area = any(isinstance(light, AreaLight) for light in scene.lights)
     if component == "bounce1" and has_area:
         area = torch.tensor([isinstance(light, AreaLight) for light in scene.lights], device=emitters.kind.device)
@@ -203,8 +207,10 @@ def illuminate(
         samples, visible = drop_unlit(lit, visibility(lit.position, lit.normal, of_area, raycaster))
     if component == "bounce1" or (blockers == "rsm" and config.occlusion != "none"):
         rsms = tuple(
-            render_rsm(scene, k, raycaster, resolution=rsm_resolution, dtype=dtype, device=device)
-            for k, light in enumerate(scene.lights)
+            render_rsm(
+                scene, light, raycaster, resolution=rsm_resolution, texel_flux=texel_flux, dtype=dtype, device=device
+            )
+            for light in scene.lights
             if not isinstance(light, AreaLight)
         )
     potential = None
