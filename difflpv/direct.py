@@ -69,7 +69,8 @@ class Emitters:
         for name, dtype in (("kind", torch.int32), ("light_index", torch.int64)):
             tensor = getattr(self, name)
             if tensor.dtype != dtype or list(tensor.shape) != [count]:
-                raise ValueError(f"{name}: expected {dtype} of shape [{count}], got {tensor.dtype} {list(tensor.shape)}")
+                got = f"{tensor.dtype} {list(tensor.shape)}"
+                raise ValueError(f"{name}: expected {dtype} of shape [{count}], got {got}")
 
     def __len__(self) -> int:
         return len(self.position)
@@ -107,7 +108,7 @@ def emitters_of(
         dtype: float32 or float64.
         device: where the emitters are put.
     """
-    rows: dict[str, list[Any]] = {name: [] for name in ("kind", "position", "direction", "power", "cone", "light_index")}
+    rows: dict[str, list[Any]] = {field.name: [] for field in fields(Emitters)}
 
     def add(kind: int, light: int, position: Any, direction: Any, power: Any, cone: tuple[float, float]) -> None:
         position = np.asarray(position, np.float64).reshape(-1, 3)

@@ -16,8 +16,7 @@ Adjoint, g_i the adjoint of E_i:
 
     Pbar_j = sum_i V_ij G_ij g_i,    pbar_j = sum_i V_ij (dG_ij/dp_j) (P_j . g_i)
 
-Shapes, a tensor [n,3] being read as n vectors: points, normals [n,3]; position, direction, power [m,3]; cone (cos
-inner, cos outer) [m,2]; visibility [n,m].
+Shapes: points, normals [n,3]; position, direction, power [m,3]; cone (cos inner, cos outer) [m,2]; visibility [n,m].
 Threads: forward, one per receiver, with a loop over emitters. Adjoint, one per (block of receivers, emitter): it
 gathers over its block and writes its own row of a partial sum [blocks, m], so there are no atomics and the result is
 deterministic.
@@ -53,6 +52,10 @@ def direct_kernels(scalar: Any) -> DirectKernels:
     module = wp.get_module(f"difflpv_direct_{scalar.__name__}")
     vec3 = wp.types.vector(3, scalar)
     vec2 = wp.types.vector(2, scalar)
+
+    @wp.func
+    def row(array: wp.array2d(dtype=scalar), i: int):
+        return vec3(array[i, 0], array[i, 1], array[i, 2])
 
     @wp.func
     def geometry_term(kind: wp.int32, position: vec3, direction: vec3, cone: vec2, x: vec3, n: vec3):
@@ -104,54 +107,59 @@ def direct_kernels(scalar: Any) -> DirectKernels:
 
     @wp.kernel(module=module, enable_backward=False)
     def forward(
-        points: wp.array(dtype=vec3),
-        normals: wp.array(dtype=vec3),
+        points: wp.array2d(dtype=scalar),
+        normals: wp.array2d(dtype=scalar),
         kind: wp.array(dtype=wp.int32),
-        position: wp.array(dtype=vec3),
-        direction: wp.array(dtype=vec3),
-        power: wp.array(dtype=vec3),
-        cone: wp.array(dtype=vec2),
+        position: wp.array2d(dtype=scalar),
+        direction: wp.array2d(dtype=scalar),
+        power: wp.array2d(dtype=scalar),
+        cone: wp.array2d(dtype=scalar),
         visibility: wp.array2d(dtype=wp.uint8),
-        irradiance: wp.array(dtype=vec3),
+        irradiance: wp.array2d(dtype=scalar),
     ):
         i = wp.tid()
-        x = points[i]
-        n = normals[i]
+        x = row(points, i)
+        n = row(normals, i)
         total = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
         for j in range(kind.shape[0]):
             if visibility[i, j] != wp.uint8(0):
-                total += power[j] * geometry_term(kind[j], position[j], direction[j], cone[j], x, n)
-        irradiance[i] = total
+                angles = vec2(cone[j, 0], cone[j, 1])
+                total += row(power, j) * geometry_term(kind[j], row(position, j), row(direction, j), angles, x, n)
+        for c in range(3):
+            irradiance[i, c] = total[c]
 
     @wp.kernel(module=module, enable_backward=False)
     def adjoint(
-        points: wp.array(dtype=vec3),
-        normals: wp.array(dtype=vec3),
+        points: wp.array2d(dtype=scalar),
+        normals: wp.array2d(dtype=scalar),
         kind: wp.array(dtype=wp.int32),
-        position: wp.array(dtype=vec3),
-        direction: wp.array(dtype=vec3),
-        power: wp.array(dtype=vec3),
-        cone: wp.array(dtype=vec2),
+        position: wp.array2d(dtype=scalar),
+        direction: wp.array2d(dtype=scalar),
+        power: wp.array2d(dtype=scalar),
+        cone: wp.array2d(dtype=scalar),
         visibility: wp.array2d(dtype=wp.uint8),
-        irradiance_gradient: wp.array(dtype=vec3),
-        position_partial: wp.array2d(dtype=vec3),
-        power_partial: wp.array2d(dtype=vec3),
+        irradiance_gradient: wp.array2d(dtype=scalar),
+        position_partial: wp.array3d(dtype=scalar),
+        power_partial: wp.array3d(dtype=scalar),
     ):
         block, j = wp.tid()
         begin = block * _BLOCK
         end = wp.min(begin + _BLOCK, points.shape[0])
         to_position = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
         to_power = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
-        p = position[j]
-        u = direction[j]
-        strength = power[j]
+        p = row(position, j)
+        u = row(direction, j)
+        angles = vec2(cone[j, 0], cone[j, 1])
+        strength = row(power, j)
         for i in range(begin, end):
             if visibility[i, j] != wp.uint8(0):
-                g = irradiance_gradient[i]
-                to_power += g * geometry_term(kind[j], p, u, cone[j], points[i], normals[i])
-                gradient = geometry_gradient(kind[j], p, u, cone[j], points[i], normals[i])
-                to_position += gradient * wp.dot(strength, g)
-        position_partial[block, j] = to_position
-        power_partial[block, j] = to_power
+                x = row(points, i)
+                n = row(normals, i)
+                g = row(irradiance_gradient, i)
+                to_power += g * geometry_term(kind[j], p, u, angles, x, n)
+                to_position += geometry_gradient(kind[j], p, u, angles, x, n) * wp.dot(strength, g)
+        for c in range(3):
+            position_partial[block, j, c] = to_position[c]
+            power_partial[block, j, c] = to_power[c]
 
     return DirectKernels(forward, adjoint)

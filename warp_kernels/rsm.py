@@ -14,9 +14,9 @@ Adjoint, with the adjoints xbar, Phibar:
     pbar   = sum_t xbar_t - n_t (d_t.xbar_t) / (n_t.d_t)
     Pbar   = sum_t w_t rho_t Phibar_t,    rhobar_t = w_t P Phibar_t
 
-Shapes, a tensor [t,3] being read as t vectors: offset, direction, normal, albedo [t,3]; plane, weight [t]; position,
-power [3], one vector each. Threads: forward, one per texel. Adjoint, one per block of texels: it writes its texels'
-rhobar and its own row of the partial sums of pbar and Pbar, so there are no atomics and the result is deterministic.
+Shapes: offset, direction, normal, albedo [t,3]; plane, weight [t]; position, power [3]. Threads: forward, one per
+texel. Adjoint, one per block of texels: it writes its texels' rhobar and its own row of the partial sums of pbar and
+Pbar, so there are no atomics and the result is deterministic.
 """
 
 # mypy: disable-error-code="valid-type"
@@ -47,53 +47,61 @@ def rsm_kernels(scalar: Any) -> RsmKernels:
     module = wp.get_module(f"difflpv_rsm_{scalar.__name__}")
     vec3 = wp.types.vector(3, scalar)
 
+    @wp.func
+    def row(array: wp.array2d(dtype=scalar), i: int):
+        return vec3(array[i, 0], array[i, 1], array[i, 2])
+
     @wp.kernel(module=module, enable_backward=False)
     def forward(
-        offset: wp.array(dtype=vec3),
-        direction: wp.array(dtype=vec3),
-        normal: wp.array(dtype=vec3),
+        offset: wp.array2d(dtype=scalar),
+        direction: wp.array2d(dtype=scalar),
+        normal: wp.array2d(dtype=scalar),
         plane: wp.array(dtype=scalar),
         weight: wp.array(dtype=scalar),
-        albedo: wp.array(dtype=vec3),
-        position: wp.array(dtype=vec3),
-        power: wp.array(dtype=vec3),
-        hit: wp.array(dtype=vec3),
-        flux: wp.array(dtype=vec3),
+        albedo: wp.array2d(dtype=scalar),
+        position: wp.array(dtype=scalar),
+        power: wp.array(dtype=scalar),
+        hit: wp.array2d(dtype=scalar),
+        flux: wp.array2d(dtype=scalar),
     ):
         t = wp.tid()
-        n = normal[t]
-        d = direction[t]
-        origin = position[0] + offset[t]
-        hit[t] = origin + d * ((plane[t] - wp.dot(n, origin)) / wp.dot(n, d))
-        flux[t] = wp.cw_mul(albedo[t], power[0]) * weight[t]
+        n = row(normal, t)
+        d = row(direction, t)
+        origin = vec3(position[0], position[1], position[2]) + row(offset, t)
+        x = origin + d * ((plane[t] - wp.dot(n, origin)) / wp.dot(n, d))
+        for c in range(3):
+            hit[t, c] = x[c]
+            flux[t, c] = albedo[t, c] * power[c] * weight[t]
 
     @wp.kernel(module=module, enable_backward=False)
     def adjoint(
-        direction: wp.array(dtype=vec3),
-        normal: wp.array(dtype=vec3),
+        direction: wp.array2d(dtype=scalar),
+        normal: wp.array2d(dtype=scalar),
         weight: wp.array(dtype=scalar),
-        albedo: wp.array(dtype=vec3),
-        power: wp.array(dtype=vec3),
-        hit_bar: wp.array(dtype=vec3),
-        flux_bar: wp.array(dtype=vec3),
-        position_partial: wp.array(dtype=vec3),
-        power_partial: wp.array(dtype=vec3),
-        albedo_bar: wp.array(dtype=vec3),
+        albedo: wp.array2d(dtype=scalar),
+        power: wp.array(dtype=scalar),
+        hit_bar: wp.array2d(dtype=scalar),
+        flux_bar: wp.array2d(dtype=scalar),
+        position_partial: wp.array2d(dtype=scalar),
+        power_partial: wp.array2d(dtype=scalar),
+        albedo_bar: wp.array2d(dtype=scalar),
     ):
         block = wp.tid()
         begin = block * _BLOCK
         end = wp.min(begin + _BLOCK, direction.shape[0])
         to_position = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
         to_power = vec3(scalar(0.0), scalar(0.0), scalar(0.0))
-        strength = power[0]
         for t in range(begin, end):
-            n = normal[t]
-            d = direction[t]
-            received = flux_bar[t] * weight[t]
-            to_position += hit_bar[t] - n * (wp.dot(d, hit_bar[t]) / wp.dot(n, d))
-            to_power += wp.cw_mul(received, albedo[t])
-            albedo_bar[t] = wp.cw_mul(received, strength)
-        position_partial[block] = to_position
-        power_partial[block] = to_power
+            n = row(normal, t)
+            d = row(direction, t)
+            x_bar = row(hit_bar, t)
+            received = row(flux_bar, t) * weight[t]
+            to_position += x_bar - n * (wp.dot(d, x_bar) / wp.dot(n, d))
+            to_power += wp.cw_mul(received, row(albedo, t))
+            for c in range(3):
+                albedo_bar[t, c] = received[c] * power[c]
+        for c in range(3):
+            position_partial[block, c] = to_position[c]
+            power_partial[block, c] = to_power[c]
 
     return RsmKernels(forward, adjoint)
