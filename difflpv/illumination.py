@@ -163,7 +163,7 @@ def illuminate(
     component: Component = "bounce1",
     *,
     surface_samples: int = 8192,
-    area_samples: int = 256,
+    area_samples: int = 64,
     rsm_resolution: int = 128,
     texel_flux: TexelFlux = "exact",
     blockers: Literal["surface", "rsm"] = "surface",
