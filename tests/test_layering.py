@@ -28,6 +28,7 @@ LAYERS: tuple[tuple[str, tuple[str, ...]], ...] = (
     (
         "values",
         (
+            "difflpv.camera_view",
             "difflpv.grid",
             "difflpv.io",
             "difflpv.lights",
@@ -55,10 +56,13 @@ LAYERS: tuple[tuple[str, tuple[str, ...]], ...] = (
             "difflpv.surface",
         ),
     ),
-    ("pipeline", ("difflpv.fitted", "difflpv.pipeline")),
+    (
+        "pipeline",
+        ("difflpv.config", "difflpv.fitted", "difflpv.illumination", "difflpv.learnables", "difflpv.pipeline"),
+    ),
     ("optim", ("difflpv.optim",)),
     ("data_gen", ("data_gen",)),
-    ("jobs", ("difflpv.evaluate", "difflpv.fit")),
+    ("jobs", ("difflpv.evaluate", "difflpv.fit", "difflpv.simulate")),
     ("report", ("difflpv.report",)),
     ("cli", ("difflpv.cli",)),
     ("scripts", ("scripts",)),
@@ -155,12 +159,15 @@ def layer_of(module: str) -> int | None:
 
 def imports_of(module: str, source: str, known: Iterable[str], *, is_package: bool = False) -> list[Import]:
     """All imports of a source text, those inside functions and ``if TYPE_CHECKING`` included (``lazy``)."""
-    known = frozenset(known)
+    known, tree = frozenset(known), ast.parse(source)
     found: list[Import] = []
+    used = {n.attr for n in ast.walk(tree) if isinstance(n, ast.Attribute) and ast.unparse(n.value) == "difflpv"}
+    version_only = used == {"__version__"}
 
     def visit(node: ast.AST, lazy: bool) -> None:
         if isinstance(node, ast.Import):
-            found.extend(Import(alias.name, node.lineno, lazy) for alias in node.names)
+            names = [alias.name for alias in node.names if not (alias.name == "difflpv" and version_only)]
+            found.extend(Import(name, node.lineno, lazy) for name in names)
         elif isinstance(node, ast.ImportFrom):
             base = node.module or ""
             if node.level:
@@ -168,6 +175,8 @@ def imports_of(module: str, source: str, known: Iterable[str], *, is_package: bo
                 parts = parts[: len(parts) - node.level + 1]
                 base = ".".join([*parts, base] if base else parts)
             for alias in node.names:
+                if base == "difflpv" and alias.name == "__version__":
+                    continue
                 submodule = f"{base}.{alias.name}"
                 found.append(Import(submodule if submodule in known else base, node.lineno, lazy))
         lazy = lazy or isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda))
@@ -175,7 +184,7 @@ def imports_of(module: str, source: str, known: Iterable[str], *, is_package: bo
         for child in ast.iter_child_nodes(node):
             visit(child, lazy or typing_only)
 
-    visit(ast.parse(source), False)
+    visit(tree, False)
     return found
 
 
@@ -291,6 +300,7 @@ BREACHES = {
     "upward import of a module by name": ("difflpv.scene", "from difflpv import pipeline", "of the layer above"),
     "library imports a script": ("difflpv.cli", "import scripts.fit_cornell", "of the layer above"),
     "package root": ("difflpv.sampling", "from difflpv import load_scene", "package root"),
+    "package root by name": ("difflpv.sampling", "import difflpv\ndifflpv.load_scene()", "package root"),
     "unknown module": ("difflpv.octree", "import numpy", "in no layer"),
     "unknown target": ("difflpv.cli", "import difflpv.octree", "in no layer"),
     "kernel knows torch": ("warp_kernels.injection", "import torch", "neither torch"),
@@ -319,4 +329,6 @@ def test_good_module_breaks_no_rule():
     source = "import torch\nfrom difflpv.bridge import launch\nfrom . import stencil\nimport warp_kernels.injection\n"
     known = {"difflpv.stencil", "warp_kernels.injection", *MODULES}
     assert violations("difflpv.injection", source, known) == []
+    assert violations("difflpv.fitted", "import difflpv\nprint(difflpv.__version__)", known) == []
+    assert violations("difflpv.fitted", "from difflpv import __version__", known) == []
     assert violations("difflpv.cli.demo", "from difflpv import load_scene\nimport data_gen.targets\n", known) == []
