@@ -1,0 +1,47 @@
+"""Which exceptions are news for the user, in one line, and which are bugs that keep their traceback."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+
+from difflpv.cli.options import UsageError
+from difflpv.io.tables import TableError
+from difflpv.scene import SceneError
+
+__all__ = ["Failure", "describe_failure"]
+
+_BAD_INPUT, _FAILED = 2, 1
+# Looked up by name, so that a command that never loaded torch does not load it to describe its error.
+_LAZY = {
+    "data_gen.load": ("TargetsError", _BAD_INPUT),
+    "data_gen.blocks": ("WorkerError", _FAILED),
+    "difflpv.io.exr": ("ImageError", _BAD_INPUT),
+    "difflpv.fitted": ("FittedError", _BAD_INPUT),
+    "difflpv.optim.checkpoint": ("CheckpointError", _BAD_INPUT),
+}
+
+
+@dataclass(frozen=True)
+class Failure:
+    """What to tell the user, and the exit code."""
+
+    line: str
+    code: int
+
+
+def describe_failure(error: Exception) -> Failure | None:
+    """The line and exit code of an expected failure; None for a bug."""
+    line = " ".join(str(error).split())
+    if isinstance(error, (UsageError, SceneError, TableError)):
+        return Failure(line, _BAD_INPUT)
+    for module, (name, code) in _LAZY.items():
+        if module in sys.modules and isinstance(error, getattr(sys.modules[module], name)):
+            return Failure(line, code)
+    if isinstance(error, FloatingPointError):  # a solve says which value made it overflow
+        return Failure(line, _FAILED)
+    if isinstance(error, OSError) and error.filename is not None:
+        return Failure(f"{error.filename}: {error.strerror}", _BAD_INPUT)
+    if isinstance(error, FileNotFoundError):
+        return Failure(line, _BAD_INPUT)
+    return None

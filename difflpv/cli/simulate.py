@@ -1,0 +1,176 @@
+"""``difflpv simulate``: irradiance of receivers by a volume solve."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from difflpv.cli.options import (
+    COMPONENTS,
+    UsageError,
+    add_command,
+    add_device,
+    add_lights,
+    add_output,
+    check_indices,
+    chosen_light,
+    seeded,
+    select_device,
+)
+from difflpv.cli.output import make_folder, print_json, warn
+from difflpv.cli.solve import Solve, add_solve, describe_solve, solve_from
+
+if TYPE_CHECKING:
+    from difflpv.evaluate import Score
+    from difflpv.io.tables import ReceiverTable
+    from difflpv.scene import Scene
+    from difflpv.simulate import Prediction
+
+__all__ = ["add_constant", "add_parser", "constant_irradiance", "run"]
+
+
+def add_parser(subparsers: Any) -> None:
+    """Add the command."""
+    parser = add_command(
+        subparsers,
+        "simulate",
+        run,
+        help="predict the irradiance of receivers",
+        description="Solve a light propagation volume and write the irradiance of a table of receivers (position [n,3] m, "
+        "normal [n,3]). Where the table holds the truth (irr_direct, irr_bounce1) the error is printed too.",
+        example="""
+        difflpv simulate cornell --method holpv --component bounce1 \\
+            --receivers out/targets/light_0.npz --out out/prediction.npz
+        """,
+    )
+    parser.add_argument("--receivers", type=Path, required=True, metavar="TABLE.npz", help="where irradiance is asked for")
+    parser.add_argument("--out", type=Path, required=True, metavar="PRED.npz", help="the table with irradiance [n,3] W/m2")
+    parser.add_argument(
+        "--component",
+        choices=COMPONENTS,
+        default="bounce1",
+        help="direct: area lights through the volume, others by shadow rays; bounce1: one bounce (default: %(default)s)",
+    )
+    add_solve(parser)
+    add_constant(parser)
+    add_lights(parser)
+    add_device(parser)
+    seeded(parser)
+    add_output(parser)
+
+
+def add_constant(parser: Any) -> None:
+    """``--targets`` of ``--method constant``."""
+    parser.add_argument(
+        "--targets", type=Path, metavar="DIR", help="for --method constant: targets whose mean it predicts (light --light)"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Predict, write, and score where the truth is known."""
+    from difflpv.evaluate import format_scores
+    from difflpv.io import load_scene
+    from difflpv.io.tables import load_receivers, load_table, save_table
+
+    started = time.perf_counter()
+    if args.out.suffix != ".npz":
+        raise UsageError(f"--out: expected a file name ending in .npz, got {args.out}")
+    scene = load_scene(args.scene)
+    table = load_receivers(args.receivers)
+    has_weight = "area_weight" in load_table(args.receivers)
+    solve = solve_from(args, scene)
+    prediction = _predict(args, scene, solve, table)
+    warnings = [*scene.warnings, *prediction.warnings]
+    warn(warnings)
+    columns: dict[str, Any] = {"position": table.position, "normal": table.normal, "irradiance": prediction.irradiance}
+    if has_weight:
+        columns["area_weight"] = table.area_weight
+    if table.albedo is not None:
+        columns["albedo"] = table.albedo
+    make_folder("--out", args.out.parent)
+    save_table(args.out, **columns)
+    scores = _scores(args, solve.label, table, prediction.irradiance)
+    seconds = time.perf_counter() - started
+    mean = np.average(prediction.irradiance, axis=0, weights=table.area_weight)
+    if args.json:
+        print_json(
+            {
+                "command": "simulate",
+                "scene": scene.name,
+                "method": solve.label,
+                "component": args.component,
+                "config": None if solve.method == "constant" else solve.config.to_json(),
+                "receivers": len(table),
+                "mean_irradiance": mean,
+                "scores": [s.to_json() for s in scores],
+                "out": args.out,
+                "seconds": round(seconds, 3),
+                "warnings": warnings,
+            }
+        )
+        return 0
+    print(f"{scene.name}, {args.component}: {describe_solve(solve)}")
+    print(f"{len(table)} receivers, mean irradiance {np.array2string(mean, precision=4)} W/m2, {seconds:.1f} s -> {args.out}")
+    if scores:
+        print(format_scores(scores))
+    return 0
+
+
+def _predict(args: argparse.Namespace, scene: Scene, solve: Solve, table: ReceiverTable) -> Prediction:
+    from difflpv.simulate import Prediction, simulate
+
+    if solve.method == "constant":
+        mean = constant_irradiance(args, scene, args.component)
+        return Prediction(np.broadcast_to(mean, table.position.shape).copy())
+    if args.targets is not None:
+        raise UsageError("--targets: only --method constant takes its mean from targets")
+    device = select_device(args.device)
+    lit = chosen_light(args, scene)
+    return simulate(
+        lit,
+        table.position,
+        table.normal,
+        grid=solve.grid,
+        component=args.component,
+        lpv=solve.model(lit),
+        seed=args.seed,
+        device=device,
+    )
+
+
+def constant_irradiance(args: argparse.Namespace, scene: Scene, component: str) -> np.ndarray:
+    """Area-weighted mean irradiance [3] W/m2 of the targets' light set ``--light``."""
+    from data_gen.load import load_targets
+    from difflpv.evaluate import predict_constant
+
+    if args.targets is None:
+        raise UsageError("--method constant: needs --targets DIR, it predicts their area-weighted mean")
+    if args.lights is not None:
+        raise UsageError("--lights: --method constant reads light set --light of --targets, not of a file")
+    targets = load_targets(args.targets)
+    targets.check_scene(scene)
+    if component not in targets.components:
+        raise UsageError(f"--component: {args.targets} has {', '.join(targets.components)}, not {component}")
+    if args.light is None and len(targets.lights) > 1:
+        raise UsageError(f"--targets: choose one of the {len(targets.lights)} light sets with --light")
+    check_indices("--light", [args.light or 0], len(targets.lights), str(args.targets))
+    light = targets.lights[args.light or 0]
+    return predict_constant(light.irradiance[component], light.area_weight)[0]
+
+
+def _scores(args: argparse.Namespace, label: str, table: ReceiverTable, irradiance: np.ndarray) -> list[Score]:
+    """The prediction's score and the constant's, where the table holds the truth."""
+    from difflpv.evaluate import predict_constant, score
+
+    component, light = args.component, args.light or 0
+    truth = table.extras.get(f"irr_{component}")
+    if truth is None or truth.shape != irradiance.shape or not np.any(truth) or not np.isfinite(truth).all():
+        return []
+    weight = table.area_weight
+    assert weight is not None
+    rows = {"constant": predict_constant(truth, weight)} | {label: irradiance}
+    return [score(p, truth, weight, method=name, component=component, light=light) for name, p in rows.items()]

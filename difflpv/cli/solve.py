@@ -1,0 +1,161 @@
+"""The options of a solve and what they mean: configuration, grid, and a fitted model in their place."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from difflpv.cli.options import METHODS, UsageError, natural, positive, usage_errors
+from difflpv.scene import Scene
+
+if TYPE_CHECKING:
+    from difflpv.config import LpvConfig
+    from difflpv.fitted import FittedRecord
+    from difflpv.grid import Grid
+    from difflpv.pipeline import Lpv
+
+__all__ = ["Solve", "add_solve", "describe_solve", "solve_from"]
+
+# Option -> field of LpvConfig. The options' defaults are None, so that one that was given can be told from one that
+# was not: a fitted model fixes them all.
+_FIELDS = ("method", "steps", "occlusion", "normalization", "reprojection", "clamp", "deposit", "occlude_first_step")
+
+
+def add_solve(parser: Any, *, methods: tuple[str, ...] = METHODS, fitted: bool = True) -> None:
+    """``--method``, ``--grid`` and what else decides a solve."""
+    group = parser.add_argument_group("solve")
+    group.add_argument(
+        "--method",
+        choices=methods,
+        help="lpv: 30 faces, 4 coefficients; holpv: 54 faces, 9 coefficients"
+        + ("; constant: the targets' mean" if "constant" in methods else "")
+        + " (default: holpv)",
+    )
+    group.add_argument(
+        "--grid", type=positive, metavar="N", help="cells along x (default: the scene's own grid; 32 where it names none)"
+    )
+    group.add_argument("--steps", type=natural, metavar="N", help="propagation steps (default: 32)")
+    occlusion = "none" if fitted else "exp where occlusion is learned, else none"
+    group.add_argument(
+        "--occlusion", choices=("none", "clamp", "exp"), help=f"how geometry blocks the volume (default: {occlusion})"
+    )
+    group.add_argument(
+        "--normalization", choices=("energy", "thesis"), help="energy keeps the flux, thesis a quarter (default: energy)"
+    )
+    group.add_argument(
+        "--reprojection", choices=("face", "ray"), help="lobe along the face's normal or the ray (default: face)"
+    )
+    group.add_argument(
+        "--no-clamp",
+        dest="clamp",
+        action="store_false",
+        default=None,
+        help="let negative intensity carry negative flux: makes transport linear (default: clamp)",
+    )
+    deposit = "nearest" if fitted else "trilinear where injection_bias or light_position is learned, else nearest"
+    group.add_argument(
+        "--deposit", choices=("nearest", "trilinear"), help=f"how VPLs enter the cells (default: {deposit})"
+    )
+    group.add_argument(
+        "--occlude-first-step",
+        action="store_true",
+        default=None,
+        help="block the first step too (default: the publications leave it free)",
+    )
+    if fitted:
+        group.add_argument(
+            "--fitted", type=Path, metavar="DIR", help="a model from 'difflpv fit', in place of the options above"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Solve:
+    """What is to be solved, and by which model.
+
+    Attributes:
+        method: "lpv", "holpv" or "constant".
+        config: of the volume; of HOLPV for "constant", which does not use it.
+        grid: cells.
+        record: the fitted model's file, or None.
+        folder: where that lies, or None.
+    """
+
+    method: str
+    config: LpvConfig
+    grid: Grid
+    record: FittedRecord | None = None
+    folder: Path | None = None
+
+    @property
+    def label(self) -> str:
+        """Name for tables."""
+        return f"{self.method} fitted" if self.record is not None else self.method
+
+    def model(self, lit: Scene) -> Lpv:
+        """The module, fitted or not; ``lit`` is the scene under the lights to solve for."""
+        from difflpv.pipeline import Lpv
+
+        if self.folder is None:
+            return Lpv(self.grid, self.config)
+        return Lpv.load(self.folder, scene=lit, grid=self.grid)
+
+
+def solve_from(args: argparse.Namespace, scene: Scene, **defaults: Any) -> Solve:
+    """The solve that the options describe.
+
+    Args:
+        args: parsed options.
+        scene: before any light set is applied.
+        **defaults: fields of ``LpvConfig`` in place of its own defaults.
+    """
+    from difflpv.config import LpvConfig, grid_for
+
+    given = {name: getattr(args, name) for name in _FIELDS if getattr(args, name) is not None}
+    folder = getattr(args, "fitted", None)
+    if folder is not None:
+        return _fitted(args, scene, folder, given)
+    method = given.get("method", "holpv")
+    with usage_errors():
+        grid = grid_for(scene, args.grid)
+        volume = {k: v for k, v in given.items() if k != "method"} | ({} if method == "constant" else {"method": method})
+        config = LpvConfig(**(defaults | volume))
+    return Solve(method, config, grid)
+
+
+def _fitted(args: argparse.Namespace, scene: Scene, folder: Path, given: dict[str, Any]) -> Solve:
+    from difflpv.config import grid_for
+    from difflpv.fitted import read_fitted
+
+    record = read_fitted(folder)
+    for name, value in given.items():
+        fixed = getattr(record.config, name)
+        if value != fixed:
+            option = "--no-clamp" if name == "clamp" else "--" + name.replace("_", "-")
+            shown = "" if isinstance(value, bool) else f" {value}"
+            raise UsageError(f"{option}{shown}: the fitted model in {folder} has {name} {fixed}")
+    grid = record.grid
+    made_for = record.provenance.get("scene")
+    same_scene = isinstance(made_for, dict) and made_for.get("hash") == scene.hash
+    if args.grid is not None or not same_scene:
+        with usage_errors():
+            grid = grid_for(scene, args.grid or record.grid.resolution[0])
+    return Solve(record.config.method, record.config, grid, record, folder)
+
+
+def describe_solve(solve: Solve) -> str:
+    """One line for people."""
+    if solve.method == "constant":
+        return "constant: the area-weighted mean of the targets"
+    config, grid = solve.config, solve.grid
+    cells = " x ".join(str(n) for n in grid.resolution)
+    parts = [
+        solve.label,
+        f"grid {cells} cells of {grid.cell_size:.4g} m",
+        f"{config.steps} steps",
+        f"occlusion {config.occlusion}",
+        f"deposit {config.deposit}",
+        f"normalization {config.normalization}",
+    ]
+    return ", ".join(parts + ([] if config.clamp else ["no clamp"]))
