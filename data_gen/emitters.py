@@ -94,14 +94,15 @@ class Emitters:
         """
         light, rest = pick(self.cumulative, u[0])
         b, c = triangle_barycentric(np.stack([rest, u[1]]))
-        delta = self._corner[:, light] + b * self._edge1[:, light] + c * self._edge2[:, light] - points
+        # ndarray.take is five times faster than indexing the second axis
+        delta = self._corner.take(light, 1) + b * self._edge1.take(light, 1) + c * self._edge2.take(light, 1) - points
         squared = np.maximum(dot(delta, delta), np.float32(1e-20))
         distance = np.sqrt(squared)
         direction = delta / distance
-        cosine = -dot(direction, self._normal[:, light])
-        cosine = np.where(self._two_sided[light], np.abs(cosine), cosine)
-        radiance = np.where(cosine > 0, self._radiance[:, light], np.float32(0))
-        pdf = self._pdf[light] * squared / np.maximum(np.abs(cosine), np.float32(1e-9))
+        cosine = -dot(direction, self._normal.take(light, 1))
+        bright = (cosine > 0) | self._two_sided.take(light)
+        radiance = self._radiance.take(light, 1) * bright
+        pdf = self._pdf.take(light) * squared / np.maximum(np.abs(cosine), np.float32(1e-9))
         return AreaSample(direction, distance, radiance, pdf)
 
     def emitted(self, triangle: np.ndarray, cosine: np.ndarray) -> np.ndarray:
@@ -112,7 +113,7 @@ class Emitters:
             cosine: of the leaving direction with the geometric normal [n].
         """
         bright = (cosine > 0) | self.triangle_two_sided[triangle]
-        return np.where(bright, self.triangle_radiance[:, triangle], np.float32(0))
+        return self.triangle_radiance.take(triangle, 1) * bright
 
     def solid_angle_pdf(self, triangle: np.ndarray, cosine: np.ndarray, distance: np.ndarray) -> np.ndarray:
         """Density per solid angle [1/sr] with which ``sample_area`` would have chosen these points, [n]."""

@@ -92,9 +92,10 @@ class PathTracer:
         cosine = dot(direction, normals)
         seen = np.flatnonzero((cosine > 0) & (irradiance.max(0) > 0))
         if len(seen):
-            toward, away = direction[:, seen], distance[seen]
-            seen = seen[self.visible_from_surface(points[:, seen], normals[:, seen], toward, away)]
-            total[:, seen] += irradiance[:, seen] * cosine[seen]
+            toward, away = direction.take(seen, 1), distance.take(seen)
+            free = self.visible_from_surface(points.take(seen, 1), normals.take(seen, 1), toward, away)
+            seen = seen[free]
+            _add_at(total, seen, irradiance.take(seen, 1) * cosine.take(seen))
 
     def area_irradiance(self, points: np.ndarray, normals: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Light-sampled part of the irradiance from area lights, weighted against cosine sampling.
@@ -117,11 +118,12 @@ class PathTracer:
         cosine = dot(sample.direction, normals)
         seen = np.flatnonzero((cosine > 0) & (sample.radiance.max(0) > 0))
         if len(seen):
-            toward, distance = sample.direction[:, seen], sample.distance[seen]
-            seen = seen[self.visible_from_surface(points[:, seen], normals[:, seen], toward, distance)]
-            pdf, cosine = sample.pdf[seen], cosine[seen]
+            toward, away = sample.direction.take(seen, 1), sample.distance.take(seen)
+            free = self.visible_from_surface(points.take(seen, 1), normals.take(seen, 1), toward, away)
+            seen = seen[free]
+            pdf, cosine = sample.pdf.take(seen), cosine.take(seen)
             weight = power_weight(pdf, cosine_hemisphere_pdf(cosine))
-            total[:, seen] = sample.radiance[:, seen] * (cosine * weight / pdf)
+            _add_at(total, seen, sample.radiance.take(seen, 1) * (cosine * weight / pdf))
         return total
 
     def _vertex_irradiance(self, points, normals, stream: SampleStream, dimension: int, paths) -> np.ndarray:
@@ -179,23 +181,23 @@ class PathTracer:
             hit = np.flatnonzero(hits.triangle >= 0)
             if not len(hit):
                 break
-            triangle, paths, throughput = hits.triangle[hit], paths[hit], throughput[:, hit]
-            directions = directions[:, hit]
-            normals = self._normal[:, triangle]
+            triangle, paths, throughput = hits.triangle.take(hit), paths.take(hit), throughput.take(hit, 1)
+            directions = directions.take(hit, 1)
+            normals = self._normal.take(triangle, 1)
             cosine = -dot(directions, normals)
             if bucket_of_bounce[k] >= 0 and self.emitters.has_area:
-                glowing = np.flatnonzero(self.emitters.triangle_pdf[triangle] > 0)
+                glowing = np.flatnonzero(self.emitters.triangle_pdf.take(triangle) > 0)
                 if len(glowing):
                     where, facing = triangle[glowing], cosine[glowing]
                     distance = hits.distance[hit[glowing]].astype(np.float32)
                     light_pdf = self.emitters.solid_angle_pdf(where, facing, distance)
                     weight = power_weight(pdf[hit[glowing]], light_pdf)
-                    light = self.emitters.emitted(where, facing) * weight * throughput[:, glowing]
-                    result[bucket_of_bounce[k]][:, paths[glowing]] += light
+                    light = self.emitters.emitted(where, facing) * weight * throughput.take(glowing, 1)
+                    _add_at(result[bucket_of_bounce[k]], paths[glowing], light)
             if k == max_bounce:
                 break
-            barycentric = hits.barycentric[hit]
-            albedo = self._albedo[:, triangle]
+            barycentric = hits.barycentric.take(hit, 0)
+            albedo = self._albedo.take(triangle, 1)
             if self._textured:
                 albedo = np.ascontiguousarray(self.scene.albedo_at(triangle, barycentric).T, np.float32)
             throughput = throughput * albedo
@@ -210,19 +212,25 @@ class PathTracer:
                 keep = np.flatnonzero(alive)
                 if not len(keep):
                     break
-                triangle, paths, throughput = triangle[keep], paths[keep], throughput[:, keep]
-                normals, cosine, barycentric = normals[:, keep], cosine[keep], barycentric[keep]
+                triangle, paths, throughput = triangle.take(keep), paths.take(keep), throughput.take(keep, 1)
+                normals, cosine, barycentric = normals.take(keep, 1), cosine.take(keep), barycentric.take(keep, 0)
             b, c = barycentric.T.astype(np.float32)
             normals = normals * np.copysign(np.float32(1), cosine)
-            points = self._corner[:, triangle] + b * self._edge1[:, triangle] + c * self._edge2[:, triangle]
+            points = self._corner.take(triangle, 1) + b * self._edge1.take(triangle, 1) + c * self._edge2.take(triangle, 1)
             base = dimension + 4 * k
             if bucket_of_bounce[k + 1] >= 0:
                 light = self._vertex_irradiance(points, normals, stream, base, paths)
-                result[bucket_of_bounce[k + 1]][:, paths] += throughput * light * np.float32(1 / np.pi)
+                _add_at(result[bucket_of_bounce[k + 1]], paths, throughput * light * np.float32(1 / np.pi))
             origins = self.lifted(points, normals)
             directions = rotate_to(cosine_hemisphere(stream.uniform(base + 2, 2, paths)), normals)
             pdf = cosine_hemisphere_pdf(dot(directions, normals))
         return result
+
+
+def _add_at(total: np.ndarray, index: np.ndarray, values: np.ndarray) -> None:
+    """``total[:, index] += values`` for distinct indices, row by row, which numpy does several times faster."""
+    for row, value in zip(total, values, strict=True):
+        row[index] += value
 
 
 def power_weight(pdf: np.ndarray, other: np.ndarray) -> np.ndarray:
