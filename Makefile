@@ -45,7 +45,7 @@ $(STAMP):
 	@mv $(VENV)/.installing $@
 
 demo: $(STAMP)
-	$(RUN) -m difflpv.cli demo --out out/demo
+	$(VENV)/bin/difflpv demo --out out/demo
 
 test: $(STAMP)
 	OMP_NUM_THREADS=1 $(RUN) -m pytest -n $(WORKERS) --dist loadfile $(PYTEST_ARGS)
