@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -110,9 +110,27 @@ class _Steps:
         }
         tensors = {k: torch.tensor(v, dtype=torch.int32, device=self.device) for k, v in topology.items()}
         tensors |= {"axis": axis.to(torch.int32), "weights": weights, "lobes": lobes, "factor": factors}
-        tensors["transmittance"] = layout.pad(transmittance) if self.occluded else transmittance
+        self._offsets, self._order, self._transmittance = cells, topology["face"], transmittance.detach()
         self._tensors = {k: v.detach().contiguous().reshape(-1) for k, v in tensors.items()}  # keeps them alive
         self._views = {k: as_warp(v) for k, v in self._tensors.items()}
+
+    @cached_property
+    def _leaving(self) -> torch.Tensor:
+        """Padded transmittance at the source cells: what the adjoint reads."""
+        return self.layout.pad(self._transmittance) if self.occluded else self._transmittance
+
+    @cached_property
+    def _arriving(self) -> torch.Tensor:
+        """Padded transmittance at the destination cells, faces in the order of ``face``: what a step reads."""
+        if not self.occluded:
+            return self._transmittance
+        layout = self.layout
+        buffer = layout.empty(self.faces, self._transmittance)
+        view = buffer[: -layout.lanes].view(layout.z + 2, layout.y + 2, self.faces, layout.pitch)
+        for i, f in enumerate(self._order):
+            x, y, z = (int(v) + 1 for v in self._offsets[f])
+            view[z : z + layout.z, y : y + layout.y, i, x : x + layout.x] = self._transmittance[f]
+        return buffer
 
     def occlude(self, step: int) -> bool:
         """True where the transmittance acts on this step."""
@@ -128,7 +146,7 @@ class _Steps:
         """S_{step+1} from S_step, added onto ``total``; all flat padded buffers."""
         v, layout = self._views, self.layout
         arguments = [
-            as_warp(moving), as_warp(into), as_warp(total), v["transmittance"], v["weights"], v["lobes"], v["factor"],
+            as_warp(moving), as_warp(into), as_warp(total), as_warp(self._arriving), v["weights"], v["lobes"], v["factor"],
             v["line_shift"], v["x_shift"], v["first"], v["face"], v["axis"], self.neighbours, self.faces, step, layout.y + 2,
             layout.pitch, layout.groups, layout.z, layout.y, layout.x,
         ]  # fmt: skip
@@ -146,7 +164,7 @@ class _Steps:
         need_transmittance = len(transmittance_bar) > 0 and self.occlude(step)
         flags = {"need_factor": len(factor_bar) > 0, "need_transmittance": need_transmittance}
         arguments = [
-            as_warp(moving), as_warp(lobe_bar), as_warp(into), as_warp(total_bar), as_warp(volume_bar), v["transmittance"],
+            as_warp(moving), as_warp(lobe_bar), as_warp(into), as_warp(total_bar), as_warp(volume_bar), as_warp(self._leaving),
             as_warp(transmittance_bar), as_warp(factor_bar), v["weights"], v["lobes"], v["factor"], v["line_shift"],
             v["x_shift"], v["face_neighbour"], v["axis"], 0 if start else self.faces // 2, self.faces, int(step == 0), step,
             layout.y + 2, layout.pitch, layout.groups, layout.z, layout.y, layout.x,

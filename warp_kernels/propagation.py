@@ -18,7 +18,8 @@ evaluates both fluxes of a source cell with one set of products.
 
 Layout: rows of cells along x, all fields of a row together: ``[n_z+2, n_y+2, fields, pitch]``, ``pitch`` =
 ceil(n_x / LANES) LANES + 2. The halo of one cell stays zero, so there are no bounds checks. Fields are (c, k) for volumes,
-f for T, (c, a) for H. Arrays are passed flat with at least ``LANES`` spare elements at the end.
+f for T, (c, a) for H. The forward step reads T where it arrives, ``arriving[i,d]`` = T[f,d-n_f] with i the place of f in
+``face``, so that every row is read in order. Arrays are passed flat with at least ``LANES`` spare elements at the end.
 
 Threads: one per (channel group, z, y) row on the CPU, one per cell on CUDA. Within a row the CPU works on ``LANES``
 neighbouring cells at once (vector extension of the compiler that Warp brings along): Warp itself does not vectorise across
@@ -55,31 +56,41 @@ _FORWARD = (
     + """
     for (int x = x_begin; x < x_end; x += LANES) {
         V flux[AXES * CHANNELS];
+        #pragma unroll
         for (int i = 0; i < AXES * CHANNELS; ++i) flux[i] = zero;
+        const SCALAR* passed = arriving.data + line * passed_line + x + 1;
         for (int n = 0; n < neighbours; ++n) {
             const SCALAR* source = moving.data + volume_at - line_shift.data[n] * volume_line + x + 1 - x_shift.data[n];
-            const SCALAR* passed =
-                transmittance.data + (line - line_shift.data[n]) * passed_line + x + 1 - x_shift.data[n];
             V s[CHANNELS * COEFFS];
+            #pragma unroll
             for (int i = 0; i < CHANNELS * COEFFS; ++i) s[i] = *(const V*)(source + i * pitch);
             for (int i = first.data[n]; i < first.data[n + 1]; ++i) {
                 const int f = face.data[i];
                 V u[CHANNELS];
+                #pragma unroll
                 for (int c = 0; c < CHANNELS; ++c) u[c] = s[c * COEFFS] * w[f * COEFFS];
+                #pragma unroll
                 for (int k = 1; k < COEFFS; ++k)
+                    #pragma unroll
                     for (int c = 0; c < CHANNELS; ++c) u[c] += s[c * COEFFS + k] * w[f * COEFFS + k];
                 if (CLAMP)
+                    #pragma unroll
                     for (int c = 0; c < CHANNELS; ++c) u[c] = u[c] > zero ? u[c] : zero;
                 if (OCCLUDED) {
-                    const V t = *(const V*)(passed + f * pitch);
+                    const V t = *(const V*)(passed + i * pitch);
+                    #pragma unroll
                     for (int c = 0; c < CHANNELS; ++c) u[c] *= t;
                 }
+                #pragma unroll
                 for (int c = 0; c < CHANNELS; ++c) flux[axis.data[f] * CHANNELS + c] += u[c];
             }
         }
+        #pragma unroll
         for (int c = 0; c < CHANNELS; ++c)
+            #pragma unroll
             for (int k = 0; k < COEFFS; ++k) {
                 V value = flux[c] * lobes.data[k];
+                #pragma unroll
                 for (int a = 1; a < AXES; ++a) value += flux[a * CHANNELS + c] * lobes.data[a * COEFFS + k];
                 value *= p;
                 SCALAR* out = next.data + volume_at + (c * COEFFS + k) * pitch + x + 1;
@@ -100,6 +111,7 @@ _ADJOINT = (
     V factor_sum = zero;
     for (int x = x_begin; x < x_end; x += LANES) {
         V s[CHANNELS * COEFFS], g[CHANNELS * COEFFS];
+        #pragma unroll
         for (int i = 0; i < CHANNELS * COEFFS; ++i) {
             g[i] = zero;
             if (NEED_FLUX) s[i] = *(const V*)(moving.data + volume_at + i * pitch + x + 1);
@@ -117,11 +129,13 @@ _ADJOINT = (
                 t0 = *(const V*)(passed + f0 * pitch);
                 t1 = *(const V*)(passed + f1 * pitch);
             }
+            #pragma unroll
             for (int c = 0; c < CHANNELS; ++c) {
                 V m0 = *(const V*)(h0 + c * AXES * pitch);
                 V m1 = *(const V*)(h1 + c * AXES * pitch);
                 if (NEED_FLUX) {
                     V even = s[c * COEFFS] * wf[0], odd = zero;
+                    #pragma unroll
                     for (int k = 1; k < COEFFS; ++k) {
                         if (ODD(k)) odd += s[c * COEFFS + k] * wf[k];
                         else even += s[c * COEFFS + k] * wf[k];
@@ -141,6 +155,7 @@ _ADJOINT = (
                     m1 *= t1;
                 }
                 const V even = m0 + m1, odd = m0 - m1;
+                #pragma unroll
                 for (int k = 0; k < COEFFS; ++k) g[c * COEFFS + k] += (ODD(k) ? odd : even) * wf[k];
             }
             if (NEED_FACTOR) factor_sum += OCCLUDED ? bar0 * t0 + bar1 * t1 : bar0 + bar1;
@@ -149,14 +164,18 @@ _ADJOINT = (
                 *(V*)(passed_bar + f1 * pitch) = *(const V*)(passed_bar + f1 * pitch) + bar1 * p;
             }
         }
+        #pragma unroll
         for (int i = 0; i < CHANNELS * COEFFS; ++i) {
             const long long at = volume_at + i * pitch + x + 1;
             g[i] = *(const V*)(accumulated_bar.data + at) + g[i] * p;
             if (write_volume) *(V*)(volume_bar.data + at) = g[i];
         }
+        #pragma unroll
         for (int c = 0; c < CHANNELS; ++c)
+            #pragma unroll
             for (int a = 0; a < AXES; ++a) {
                 V value = g[c * COEFFS] * lobes.data[a * COEFFS];
+                #pragma unroll
                 for (int k = 1; k < COEFFS; ++k) value += g[c * COEFFS + k] * lobes.data[a * COEFFS + k];
                 SCALAR* out = lobe_bar_next.data + lobe_at + (c * AXES + a) * pitch + x + 1;
                 *(V*)out = value;
@@ -215,14 +234,14 @@ def forward_kernel(
 
     @wp.func_native(_Spec(scalar, coeffs, axes, channels, lanes, clamp, occluded).snippet(_FORWARD))
     def forward_row(
-        moving: floats, next: floats, accumulated: floats, transmittance: floats, weights: floats, lobes: floats,
+        moving: floats, next: floats, accumulated: floats, arriving: floats, weights: floats, lobes: floats,
         factor: floats, line_shift: ints, x_shift: ints, first: ints, face: ints, axis: ints, neighbours: int, faces: int,
         step: int, pitch_y: int, pitch: int, groups: int, x_size: int, x_begin: int, x_end: int, group: int, z: int, y: int,
     ): ...  # fmt: skip
 
     @wp.kernel(enable_backward=False, module="unique")
     def propagate_forward(
-        moving: floats, next: floats, accumulated: floats, transmittance: floats, weights: floats, lobes: floats,
+        moving: floats, next: floats, accumulated: floats, arriving: floats, weights: floats, lobes: floats,
         factor: floats, line_shift: ints, x_shift: ints, first: ints, face: ints, axis: ints, neighbours: int, faces: int,
         step: int, pitch_y: int, pitch: int, groups: int, z_size: int, y_size: int, x_size: int, row: int,
     ):  # fmt: skip
@@ -232,7 +251,7 @@ def forward_kernel(
         z = (line // y_size) % z_size
         x_begin, x_end = wp.where(wp.static(lanes == 1), x, 0), wp.where(wp.static(lanes == 1), x + 1, x_size)
         forward_row(
-            moving, next, accumulated, transmittance, weights, lobes, factor, line_shift, x_shift, first, face, axis,
+            moving, next, accumulated, arriving, weights, lobes, factor, line_shift, x_shift, first, face, axis,
             neighbours, faces, step, pitch_y, pitch, groups, x_size, x_begin, x_end, line // (y_size * z_size), z, y,
         )  # fmt: skip
 
