@@ -16,7 +16,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from tqdm import tqdm
@@ -116,7 +116,7 @@ class BlockStore:
 
     def save(self, block: Block, means: np.ndarray, rays: int, seconds: float) -> None:
         """Write a finished block's replicate means, atomically."""
-        save_table(self.path(block), means=means.astype(np.float32), rays=rays, seconds=seconds)
+        save_table(self.path(block), means=means, rays=rays, seconds=seconds)
 
     def load(self, block: Block) -> tuple[np.ndarray, int, float] | None:
         """Replicate means, rays and seconds of a finished block; None where it has to be computed."""
@@ -137,30 +137,21 @@ def compute_block(job: Job, tracers: dict[int, PathTracer], block: Block) -> tup
     before = tracer.rays
     part = job.parts[block.quantity]
     rows = slice(block.chunk * part.chunk, min((block.chunk + 1) * part.chunk, part.count))
-    address = (block.light, _QUANTITIES.index(block.quantity), block.chunk)
+    options: dict[str, Any] = {
+        "samples": part.samples,
+        "seed": job.seed,
+        "address": (block.light, _QUANTITIES.index(block.quantity), block.chunk),
+        "round": block.round,
+    }
     if block.quantity == "surface":
-        means = irradiance_block(
-            tracer,
-            job.positions[rows],
-            job.normals[rows],
-            part.components,
-            samples=part.samples,
-            seed=job.seed,
-            address=address,
-            round=block.round,
-        )
+        means = irradiance_block(tracer, job.positions[rows], job.normals[rows], part.components, **options)
     elif block.quantity == "probes":
-        means = probe_block(
-            tracer, job.probes[rows], part.components, samples=part.samples, seed=job.seed, address=address, round=block.round
-        )
+        means = probe_block(tracer, job.probes[rows], part.components, **options)
     else:
         if job.camera is None:
             raise ValueError("image block: the job has no camera")
-        pixels = np.arange(rows.start, rows.stop)
-        means = image_block(
-            tracer, job.camera, pixels, part.components, samples=part.samples, seed=job.seed, address=address, round=block.round
-        )
-    return means, tracer.rays - before, time.perf_counter() - start
+        means = image_block(tracer, job.camera, np.arange(rows.start, rows.stop), part.components, **options)
+    return means.astype(np.float32), tracer.rays - before, time.perf_counter() - start
 
 
 _worker: tuple[Job, dict[int, PathTracer]] | None = None
@@ -254,4 +245,4 @@ class BlockRunner:
             )
         futures = {self._pool.submit(_work, block): block for block in missing}
         for future in as_completed(futures):
-            yield futures[future], future.result()
+            yield futures.pop(future), future.result()  # popped: thousands of results would pile up here

@@ -216,7 +216,8 @@ class PathTracer:
                 normals, cosine, barycentric = normals.take(keep, 1), cosine.take(keep), barycentric.take(keep, 0)
             b, c = barycentric.T.astype(np.float32)
             normals = normals * np.copysign(np.float32(1), cosine)
-            points = self._corner.take(triangle, 1) + b * self._edge1.take(triangle, 1) + c * self._edge2.take(triangle, 1)
+            points = self._corner.take(triangle, 1)
+            points += b * self._edge1.take(triangle, 1) + c * self._edge2.take(triangle, 1)
             base = dimension + 4 * k
             if bucket_of_bounce[k + 1] >= 0:
                 light = self._vertex_irradiance(points, normals, stream, base, paths)

@@ -71,6 +71,8 @@ class TargetRun:
     def errors(self, estimate: Estimate, light: int) -> dict[str, float]:
         """Mean standard error over mean, per component, over receivers that have a weight."""
         counted = self.weights[light] > 0
+        if not counted.any():  # all behind a panel: better their own error than none
+            counted[:] = True
         mean = estimate.mean[counted].mean((0, 2))
         error = estimate.standard_error[counted].mean((0, 2))
         names = self.job.parts["surface"].components.names

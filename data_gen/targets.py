@@ -17,20 +17,23 @@ import numpy as np
 
 from data_gen.blocks import BlockRunner, BlockStore, Job, JobPart, Quantity, round_samples
 from data_gen.components import Components
+from data_gen.estimators import REPLICATES
 from data_gen.freespace import draw_probes
 from data_gen.load import FORMAT, MANIFEST, Targets, TargetsError, file_digest, load_targets, read_manifest
 from data_gen.receivers import draw_receivers
 from data_gen.request import describe_request, light_entries, request_digest, versions
+from data_gen.rng import MAX_SAMPLES
 from data_gen.run import TargetRun
 from difflpv.io.atomic import write_json
 from difflpv.io.tables import ReceiverTable
 from difflpv.lights import apply_light_set
 from difflpv.scene import Scene
 
-__all__ = ["DEFAULT_COMPONENTS", "PROBE_COMPONENTS", "make_targets"]
+__all__ = ["DEFAULT_COMPONENTS", "MAX_SPP", "PROBE_COMPONENTS", "make_targets"]
 
 DEFAULT_COMPONENTS = ("direct", "bounce1", "full")
 PROBE_COMPONENTS = ("direct", "bounce1", "full_indirect")
+MAX_SPP = MAX_SAMPLES * REPLICATES
 
 
 def make_targets(
@@ -88,7 +91,7 @@ def make_targets(
         raise TargetsError("samples: give spp or target_error, not both")
     if spp is None and target_error is None:
         target_error = 0.01
-    _check_counts(spp, target_error, max_spp, probes, probe_spp, image_spp, workers, receiver_count)
+    _check_counts(spp, target_error, max_spp, probes, probe_spp, image_spp, seed, workers, receiver_count)
     try:
         wanted = Components.of(components)
     except ValueError as error:
@@ -176,18 +179,23 @@ def make_targets(
     return load_targets(out)
 
 
-def _check_counts(spp, target_error, max_spp, probes, probe_spp, image_spp, workers, receiver_count) -> None:
-    for name, value, least in (
-        ("spp", spp, 1),
-        ("max_spp", max_spp, 1),
-        ("probes", probes, 0),
-        ("probe_spp", probe_spp, 1),
-        ("image_spp", image_spp, 1),
-        ("workers", workers, 1),
-        ("receiver_count", receiver_count, 1),
+def _check_counts(spp, target_error, max_spp, probes, probe_spp, image_spp, seed, workers, receiver_count) -> None:
+    for name, value, least, most in (
+        ("spp", spp, 1, MAX_SPP),
+        ("max_spp", max_spp, 1, MAX_SPP),
+        ("probes", probes, 0, None),
+        ("probe_spp", probe_spp, 1, MAX_SPP),
+        ("image_spp", image_spp, 1, MAX_SPP),
+        ("seed", seed, 0, None),
+        ("workers", workers, 1, None),
+        ("receiver_count", receiver_count, 1, None),
     ):
-        if value is not None and (int(value) != value or value < least):
+        if value is None:
+            continue
+        if int(value) != value or value < least:
             raise TargetsError(f"{name}: expected an integer >= {least}, got {value}")
+        if most is not None and value > most:
+            raise TargetsError(f"{name}: expected at most {most}, got {value}")
     if target_error is not None and not 0 < target_error < 1:
         raise TargetsError(f"target_error: expected a share between 0 and 1, got {target_error}")
 

@@ -175,6 +175,8 @@ def test_damaged_targets_have_clear_messages(cornell, tmp_path):
     ("options", "message"),
     [
         ({"spp": 0}, "spp: expected an integer >= 1, got 0"),
+        ({"spp": 10**7}, "spp: expected at most 2097152"),
+        ({"seed": -1}, "seed: expected an integer >= 0"),
         ({"spp": 16, "target_error": 0.1}, "spp or target_error, not both"),
         ({"target_error": 1.5}, "share between 0 and 1"),
         ({"workers": 0}, "workers"),
