@@ -1,10 +1,11 @@
 """Speed of propagation as ratios measured in one run: a step against conv3d, the adjoint against the forward.
 
-    python benchmarks/propagation.py [--cells 32 64] [--steps 32] [--repeats 9] [--json OUT]
+    python benchmarks/propagation.py [--cells 32 64] [--steps 32] [--repeats 5] [--device cpu|cuda] [--json OUT]
 
-Peers: torch's conv3d (channels_last_3d) with the equivalent linear weights; torch autograd through it; the best vectorised
-torch formulation of clamp and occlusion (a matrix product to all face fluxes, clamp, occlusion, shifted adds), eager.
-Configurations alternate so that the machine's drift hits all alike; medians are printed.
+Peers: torch's conv3d with the equivalent linear weights (channels_last_3d; autograd through it in both layouts) and the best
+vectorised torch formulation of clamp and occlusion that we know (a product to all face fluxes, clamp, occlusion, shifted
+sums per lobe axis, a product back). Configurations take turns, so that the machine's drift hits
+all alike; medians are printed. The slow peers run fewer times.
 """
 
 from __future__ import annotations
@@ -21,26 +22,29 @@ from difflpv.propagation import propagate
 from difflpv.stencil import FaceStencil, holpv_stencil, lpv_stencil
 
 
-def interleaved(calls: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
-    """Median seconds of each call, taken in turns after one warm-up."""
+def interleaved(calls: dict[str, Callable[[], object]], repeats: int, device: torch.device) -> dict[str, float]:
+    """Median seconds of each call, taken in turns after one warm-up; those named "torch ..." run twice at most."""
     times: dict[str, list[float]] = {name: [] for name in calls}
-    for call in calls.values():
-        call()
-    for _ in range(repeats):
+    for round_number in range(-1, repeats):
         for name, call in calls.items():
+            if name.startswith("torch") and round_number >= 2:
+                continue
             start = time.perf_counter()
             call()
-            times[name].append(time.perf_counter() - start)
+            if device.type == "cuda":
+                torch.cuda.synchronize(device)
+            if round_number >= 0:
+                times[name].append(time.perf_counter() - start)
     return {name: statistics.median(values) for name, values in times.items()}
 
 
 def torch_faces(volume: torch.Tensor, stencil: FaceStencil, factors: torch.Tensor, passed: torch.Tensor) -> torch.Tensor:
     """Vectorised torch: fluxes of all faces by one product, clamp, occlusion; per lobe axis shifted sums, one product back."""
-    weights = torch.tensor(stencil.flux_weights, dtype=volume.dtype)
+    weights = torch.tensor(stencil.flux_weights, dtype=volume.dtype, device=volume.device)
     axes = torch.tensor(stencil.lobe_axes)
     names = torch.unique(axes, dim=0)
     owner = [int((names == a).all(1).nonzero()) for a in axes]
-    lobes = torch.stack([torch.tensor(stencil.lobes[owner.index(i)], dtype=volume.dtype) for i in range(len(names))])
+    lobes = torch.stack([torch.tensor(stencil.lobes[owner.index(i)]) for i in range(len(names))]).to(volume)
     moving = total = volume
     size = volume.shape[2:]
     for factor in factors:
@@ -57,15 +61,16 @@ def torch_faces(volume: torch.Tensor, stencil: FaceStencil, factors: torch.Tenso
 
 
 def torch_convolution(volume: torch.Tensor, weight: torch.Tensor, factors: torch.Tensor) -> torch.Tensor:
-    """Autograd through conv3d, channels_last_3d."""
-    moving = total = volume.contiguous(memory_format=torch.channels_last_3d)
+    """Autograd through conv3d, in the layout of ``weight``."""
+    last = weight.is_contiguous(memory_format=torch.channels_last_3d)
+    moving = total = volume.contiguous(memory_format=torch.channels_last_3d) if last else volume
     for factor in factors:
         moving = factor * torch.nn.functional.conv3d(moving, weight, padding=1)
         total = total + moving
     return total
 
 
-def measure(stencil: FaceStencil, cells: int, steps: int, repeats: int) -> dict[str, float]:
+def measure(stencil: FaceStencil, cells: int, steps: int, repeats: int, device: torch.device) -> dict[str, float]:
     """All ratios of one stencil at one size."""
     generator = torch.Generator().manual_seed(0)
     coeffs = (stencil.l_max + 1) ** 2
@@ -76,8 +81,10 @@ def measure(stencil: FaceStencil, cells: int, steps: int, repeats: int) -> dict[
     weight = torch.zeros(coeffs, coeffs, 3, 3, 3)
     for n, matrix in zip(linear.offsets.tolist(), linear.matrices, strict=True):
         weight[:, :, 1 - n[2], 1 - n[1], 1 - n[0]] = torch.tensor(matrix, dtype=torch.float32)
-    weight = weight.contiguous(memory_format=torch.channels_last_3d)
-    factors = torch.full((steps,), 0.97)
+    volume, passed, weight = volume.to(device), passed.to(device), weight.to(device)
+    fast_weight = weight.contiguous(memory_format=torch.channels_last_3d)
+    factors = torch.full((steps,), 0.97, device=device)
+    cotangent = torch.randn(volume.shape, generator=generator).to(device)
 
     def forward(**options: object) -> Callable[[], object]:
         def call() -> object:
@@ -89,7 +96,7 @@ def measure(stencil: FaceStencil, cells: int, steps: int, repeats: int) -> dict[
     def both(solve: Callable[[torch.Tensor, torch.Tensor], torch.Tensor]) -> Callable[[], object]:
         def call() -> object:
             light, learned = volume.clone().requires_grad_(), factors.clone().requires_grad_()
-            return torch.autograd.grad(solve(light, learned).sum(), (light, learned))
+            return torch.autograd.grad(solve(light, learned), (light, learned), cotangent)
 
         return call
 
@@ -98,11 +105,12 @@ def measure(stencil: FaceStencil, cells: int, steps: int, repeats: int) -> dict[
 
     def conv_forward() -> object:
         with torch.no_grad():
-            return torch_convolution(volume, weight, factors)
+            return torch_convolution(volume, fast_weight, factors)
 
     calls: dict[str, Callable[[], object]] = {
         "conv3d forward": conv_forward,
-        "conv3d autograd": both(lambda v, p: torch_convolution(v, weight, p)),
+        "torch autograd through conv3d": both(lambda v, p: torch_convolution(v, fast_weight, p)),
+        "torch autograd through conv3d, contiguous": both(lambda v, p: torch_convolution(v, weight, p)),
         "linear forward": forward(clamp=False),
         "linear both": ours(clamp=False),
         "clamp forward": forward(),
@@ -110,20 +118,26 @@ def measure(stencil: FaceStencil, cells: int, steps: int, repeats: int) -> dict[
         "clamp+occlusion forward": forward(transmittance=passed),
         "clamp+occlusion both": ours(transmittance=passed),
         "torch faces forward": lambda: torch_faces(volume, stencil, factors, passed),
+        "linear warp forward": forward(clamp=False, backend="warp"),
+        "linear warp both": ours(clamp=False, backend="warp"),
         "torch faces both": both(lambda v, p: torch_faces(v, stencil, p, passed)),
     }
-    t = interleaved(calls, repeats)
+    t = interleaved(calls, repeats, device)
     occluded = t["clamp+occlusion forward"]
     return {
         **{f"{name} [ms]": 1e3 * seconds for name, seconds in t.items()},
-        "step, clamp and occlusion / conv3d": occluded / t["conv3d forward"],
+        "step with clamp and occlusion / conv3d": occluded / t["conv3d forward"],
+        "step with clamp / conv3d": t["clamp forward"] / t["conv3d forward"],
+        "step, linear on Warp / conv3d": t["linear warp forward"] / t["conv3d forward"],
         "forward+backward / forward, linear": t["linear both"] / t["linear forward"],
+        "forward+backward / forward, linear on Warp": t["linear warp both"] / t["linear warp forward"],
         "forward+backward / forward, clamp": t["clamp both"] / t["clamp forward"],
         "forward+backward / forward, clamp and occlusion": t["clamp+occlusion both"] / occluded,
-        "autograd through conv3d / ours, linear": t["conv3d autograd"] / t["linear both"],
-        "autograd through conv3d / ours, clamp": t["conv3d autograd"] / t["clamp both"],
-        "torch faces / ours, occlusion, forward": t["torch faces forward"] / occluded,
-        "torch faces / ours, occlusion, forward+backward": t["torch faces both"] / t["clamp+occlusion both"],
+        "autograd through conv3d / ours, linear": t["torch autograd through conv3d"] / t["linear both"],
+        "autograd through conv3d / ours, clamp": t["torch autograd through conv3d"] / t["clamp both"],
+        "  the same, contiguous layout / ours, clamp": t["torch autograd through conv3d, contiguous"] / t["clamp both"],
+        "torch faces / ours, clamp and occlusion, forward": t["torch faces forward"] / occluded,
+        "torch faces / ours, clamp and occlusion, both": t["torch faces both"] / t["clamp+occlusion both"],
     }
 
 
@@ -132,12 +146,13 @@ def main() -> None:
     parser.add_argument("--cells", type=int, nargs="+", default=[32, 64])
     parser.add_argument("--steps", type=int, default=32)
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--device", default="cpu")
     parser.add_argument("--json")
     arguments = parser.parse_args()
     results = {}
     for cells in arguments.cells:
         for stencil in (lpv_stencil(), holpv_stencil()):
-            row = measure(stencil, cells, arguments.steps, arguments.repeats)
+            row = measure(stencil, cells, arguments.steps, arguments.repeats, torch.device(arguments.device))
             results[f"{stencil.name} {cells}"] = row
             print(f"{stencil.name} {cells}^3, {arguments.steps} steps, {torch.get_num_threads()} threads")
             for name, value in row.items():

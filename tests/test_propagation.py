@@ -283,3 +283,19 @@ def test_linear_stencils_may_leave_out_neighbours(generator):
     moved = propagate(volume, one_way, steps=1) - volume
     torch.testing.assert_close(moved[..., 1:], volume[..., :-1])
     assert not moved[..., 0].any()
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", ["lpv", "holpv"])
+def test_cuda_equals_cpu(name, cuda, dtype, generator):
+    stencil = STENCILS[name]
+    volume, passed, factors = random_problem(stencil, (5, 6, 9), 5, generator, dtype=dtype)
+    cotangent = torch.rand(volume.shape, generator=generator, dtype=dtype)
+    results = []
+    for device in (torch.device("cpu"), cuda):
+        inputs = [t.detach().to(device).requires_grad_() for t in (volume, factors, passed)]
+        result = propagate(inputs[0], stencil, steps=5, factor=inputs[1], transmittance=inputs[2])
+        results.append((result, *torch.autograd.grad(result, inputs, cotangent.to(device))))
+    for host, device_result in zip(*results, strict=True):
+        difference = (device_result.cpu() - host).norm()
+        assert difference <= (1e-5 if dtype == torch.float32 else 1e-12) * host.norm()
