@@ -253,7 +253,7 @@ def _propagate_backward(
         volume_bar = total_bar
     else:
         none = accumulated_bar.new_empty(0)
-        steps.adjoint(total_bar, lobe_bar_next, lobe_bar, total_bar, volume_bar, none, none, count, start=True)
+        steps.adjoint(total_bar, lobe_bar_next, lobe_bar, total_bar, volume_bar, none, none, count - 1, start=True)
     for begin in reversed(range(0, count, keep or count or 1)):
         end = min(begin + (keep or count), count)
         volumes = [states[begin // keep], *segment] if keep else [total_bar] * count

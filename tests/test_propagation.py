@@ -299,3 +299,15 @@ def test_cuda_equals_cpu(name, cuda, dtype, generator):
     for host, device_result in zip(*results, strict=True):
         difference = (device_result.cpu() - host).norm()
         assert difference <= (1e-5 if dtype == torch.float32 else 1e-12) * host.norm()
+
+
+@pytest.mark.parametrize("steps", [1, 3])
+def test_nothing_beyond_the_factors_is_read(steps, generator):
+    """A NaN right behind the factors in memory must not reach a gradient."""
+    volume, passed, _ = random_problem(lpv_stencil(), (3, 4, 5), steps, generator)
+    memory = torch.full((steps + 1,), torch.nan, dtype=torch.float64)
+    memory[:steps] = 0.9
+    factors = memory[:steps].requires_grad_()
+    result = propagate(volume, lpv_stencil(), steps=steps, factor=factors, transmittance=passed)
+    for gradient in torch.autograd.grad(result.sum(), (volume, passed, factors)):
+        assert gradient.isfinite().all()
