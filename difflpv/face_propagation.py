@@ -243,7 +243,8 @@ def _propagate_backward(
     total_bar, volume_bar = layout.pad(accumulated_bar), layout.empty(fields, accumulated_bar)
     lobe_bar = layout.empty(layout.channels * len(lobes), accumulated_bar)
     lobe_bar_next = torch.zeros_like(lobe_bar)
-    factor_bar = accumulated_bar.new_zeros(len(factors) * layout.rows if need_factors else 0)
+    # the kernel that makes the transmittance's gradient writes the factors' too
+    factor_bar = accumulated_bar.new_zeros(len(factors) * layout.rows if need_factors or need_transmittance else 0)
     faces = len(transmittance) if need_transmittance else 0
     transmittance_bar = layout.empty(faces, accumulated_bar) if faces else accumulated_bar.new_empty(0)
     segment = [layout.empty(fields, accumulated_bar) for _ in range(min(keep, len(factors)) - 1)] if keep else []
@@ -269,6 +270,8 @@ def _propagate_backward(
         transmittance_bar = layout.inside(transmittance_bar, faces).contiguous()
     if need_factors:
         factor_bar = factor_bar.view(len(factors), layout.rows).sum(1)
+    else:
+        factor_bar = accumulated_bar.new_empty(0)
     return volume_bar, factor_bar, transmittance_bar
 
 

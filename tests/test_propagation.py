@@ -311,3 +311,15 @@ def test_nothing_beyond_the_factors_is_read(steps, generator):
     result = propagate(volume, lpv_stencil(), steps=steps, factor=factors, transmittance=passed)
     for gradient in torch.autograd.grad(result.sum(), (volume, passed, factors)):
         assert gradient.isfinite().all()
+
+
+def test_transmittance_alone_has_a_gradient(generator):
+    """Without one for the factors, which the same kernel makes."""
+    volume, passed, factors = random_problem(holpv_stencil(), (3, 4, 5), 3, generator)
+
+    def gradient(*inputs):
+        factor = factors if len(inputs) > 1 else factors.detach()
+        result = propagate(volume.detach(), holpv_stencil(), steps=3, factor=factor, transmittance=passed)
+        return torch.autograd.grad(result.square().sum(), inputs)[0]
+
+    assert torch.equal(gradient(passed), gradient(passed, factors))
