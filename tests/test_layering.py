@@ -66,7 +66,8 @@ LAYERS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("optim", ("difflpv.optim",)),
     ("data_gen", ("data_gen",)),
     ("jobs", ("difflpv.evaluate", "difflpv.fit", "difflpv.simulate", "difflpv.training")),
-    ("report", ("difflpv.demo", "difflpv.report")),
+    ("report", ("difflpv.report",)),
+    ("demo", ("difflpv.demo",)),
     ("cli", ("difflpv.cli",)),
     ("scripts", ("scripts",)),
 )
@@ -118,7 +119,7 @@ ONLY = (
 )
 
 # Only these parts may know the path tracer: what they judge must not.
-DATA_GEN_USERS = ("data_gen", "difflpv.cli", "difflpv.demo", "difflpv.report", "scripts")
+DATA_GEN_USERS = ("data_gen", "difflpv.cli", "difflpv.demo", "scripts")
 
 LIBRARY_OWNERS: dict[str, tuple[str, ...]] = {
     "warp": ("warp_kernels", "difflpv.bridge", "difflpv.face_propagation"),

@@ -1,0 +1,1 @@
+"""Reports: figures (``figures``) and one self-contained page (``page``) from plain numbers and images."""
