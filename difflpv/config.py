@@ -7,11 +7,14 @@ from typing import Any, Literal, get_args
 
 from difflpv.grid import Grid
 from difflpv.scene import Scene
-from difflpv.stencil import FaceStencil, Normalization, Reprojection, holpv_stencil, lpv_stencil
+from difflpv.stencil import FaceStencil, LinearStencil, Normalization, Reprojection, holpv_stencil, lpv_stencil
+from difflpv.stencil_files import LEARNED_STENCILS, learned_stencil
 
 __all__ = ["METHODS", "OCCLUSION_CHOICES", "LpvConfig", "Method", "Occlusion", "grid_for"]
 
-Method = Literal["lpv", "holpv"]
+Method = Literal[
+    "lpv", "holpv", "learned_4x6", "learned_9x6", "learned_4x26", "learned_9x26", "learned_16x26"
+]
 Occlusion = Literal["none", "clamp", "exp"]
 METHODS: tuple[str, ...] = get_args(Method)
 OCCLUSION_CHOICES: tuple[str, ...] = get_args(Occlusion)
@@ -23,7 +26,8 @@ class LpvConfig:
     """Closed choices of a solve; the defaults are the publications' (physics.md lists what they measure).
 
     Attributes:
-        method: "lpv" (30 faces, l_max 1) or "holpv" (54 faces, l_max 2).
+        method: "lpv" (30 faces, l_max 1), "holpv" (54 faces, l_max 2), or a learned stencil, "learned_<K>x<neighbours>".
+            A learned one is linear: ``clamp`` is off, and it takes no occlusion.
         steps: propagation steps.
         occlusion: "none", or the geometry volume with "clamp" (publications) or "exp" (smooth).
         normalization: "energy" keeps an isotropic field's flux, "thesis" a quarter of it per step.
@@ -61,11 +65,25 @@ class LpvConfig:
             raise ValueError(f"steps: expected a number >= 0, got {self.steps}")
         if not self.tolerance >= 0:
             raise ValueError(f"tolerance: expected a number >= 0, got {self.tolerance}")
+        if self.method in LEARNED_STENCILS:
+            object.__setattr__(self, "clamp", False)
+            self._check_learned()
         _ = self.stencil
 
+    def _check_learned(self) -> None:
+        own = learned_stencil(self.method).l_max
+        needed = {"occlusion": "none", "normalization": "energy", "reprojection": "face"}
+        for name, value in needed.items():
+            if getattr(self, name) != value:
+                raise ValueError(f"{name}: the linear stencil '{self.method}' needs '{value}', got {getattr(self, name)!r}")
+        if self.l_max not in (None, own):
+            raise ValueError(f"l_max: '{self.method}' has {own}, got {self.l_max}")
+
     @property
-    def stencil(self) -> FaceStencil:
+    def stencil(self) -> FaceStencil | LinearStencil:
         """The propagation stencil."""
+        if self.method in LEARNED_STENCILS:
+            return learned_stencil(self.method)
         make, own = {"lpv": (lpv_stencil, 1), "holpv": (holpv_stencil, 2)}[self.method]
         l_max = own if self.l_max is None else self.l_max
         return make(l_max=l_max, normalization=self.normalization, reprojection=self.reprojection)

@@ -27,6 +27,7 @@ from difflpv.occlusion import Blockers, blocking_potential, geometry_volume
 from difflpv.raycast import Raycaster
 from difflpv.rsm import Rsm, TexelFlux, render_rsm, rsm_blockers, rsm_vpls
 from difflpv.scene import AreaLight, Scene
+from difflpv.stencil import FaceStencil
 from difflpv.surface import SurfaceSamples, sample_surfaces
 from difflpv.vpl import Vpls
 
@@ -226,6 +227,7 @@ def illuminate(
             )
             surfels = Blockers(s.position, s.normal, s.area)
         stencil = config.stencil
+        assert isinstance(stencil, FaceStencil)  # LpvConfig refuses occlusion with a linear one
         corners = geometry_volume(surfels, grid, l_max=stencil.l_max, two_sided=blockers == "surface")
         potential = blocking_potential(corners, stencil.offsets, stencil.directions)
     if component == "direct":

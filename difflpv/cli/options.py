@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "COMPONENTS",
+    "LEARNED",
     "METHODS",
     "UsageError",
     "add_command",
@@ -40,7 +41,8 @@ __all__ = [
 ]
 
 COMPONENTS = ("direct", "bounce1")
-METHODS = ("lpv", "holpv", "constant")
+LEARNED = ("learned_4x6", "learned_9x6", "learned_4x26", "learned_9x26", "learned_16x26")
+METHODS = ("lpv", "holpv", *LEARNED, "constant")
 
 
 class UsageError(ValueError):

@@ -29,7 +29,7 @@ def add_solve(parser: Any, *, methods: tuple[str, ...] = METHODS, fitted: bool =
     group.add_argument(
         "--method",
         choices=methods,
-        help="lpv: 30 faces, 4 coefficients; holpv: 54 faces, 9 coefficients"
+        help="lpv: 30 faces, 4 coefficients; holpv: 54 faces, 9 coefficients; learned_KxN: K coefficients, N neighbours"
         + ("; constant: the targets' mean" if "constant" in methods else "")
         + " (default: holpv)",
     )

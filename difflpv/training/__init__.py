@@ -1,0 +1,1 @@
+"""Training of propagation stencils on closed forms (``difflpv.training.stencils``)."""
