@@ -3,8 +3,8 @@
 The free numbers are coordinates in the basis of cube-symmetric stencils, less the one direction that the unit l=0 gain fixes.
 A run starts from the published kernel (LPV for 6 neighbours, HOLPV for 26) at short range, then reads receivers out to 16
 cells after 20, 30 and 34 steps: light must arrive in time and must not come back later. Lit planes (``PlaneLoss``) keep the
-errors of single cells from adding up over a wall: without them a wall lights itself with a sixth of its exitance. One round is up to 10 L-BFGS
-iterations; after each the state is on the disk, and a run that is cut off goes on to the same bits.
+errors of single cells from adding up over a wall: without them a wall lights itself with a sixth of its exitance. One round
+is up to 10 L-BFGS iterations; after each the state is on the disk, and a run that is cut off goes on to the same bits.
 """
 
 from __future__ import annotations
