@@ -150,11 +150,14 @@ def test_verdict_tells_what_is_only_brightness():
 def test_limits_tell_amplification_and_leaks_only_where_there_are_any():
     text = " ".join(limits(summary()))
     assert "above 1: 1 of 3 for LPV fitted (up to 1.08)" in text and "(nearly) 0" in text and "worst under light 3" in text
+    assert "A constant beats" not in text
     tame = copy.deepcopy(summary())
+    next(s for s in tame["scores"] if (s["method"], s["light"]) == ("LPV fitted", 1))["relative_l2"] = 0.9
     for fit in tame["fits"].values():
         fit["factors"], fit["parameters"]["occlusion"] = [0.9, 1.0], 0.8
     text = " ".join(limits(tame))
     assert "above 1" not in text and "nearly" not in text
+    assert text.count("A constant beats it under light 1.") == 1
 
 
 def test_error_maps_show_sign_size_and_mask():
@@ -167,7 +170,7 @@ def test_error_maps_show_sign_size_and_mask():
     def drawn(prediction, hit=hit):
         return pixels(draw_renders(truth, {"LPV": prediction}, hit, {}))
 
-    same, bright, dark = drawn(truth), drawn(3 * truth), drawn(0 * truth)
+    same, bright, dark = drawn(truth), drawn(4 * truth), drawn(-2 * truth)
     area = count(same, white) - count(bright, white)
     assert area > 10000
     assert count(bright, red) - count(same, red) == pytest.approx(area, rel=0.02)

@@ -41,6 +41,7 @@ _METHODS: tuple[Method, ...] = ("lpv", "holpv")
 _IN_TABLE = ("constant", "LPV", "LPV fitted", "LPV nlopt", "HOLPV", "HOLPV fitted", "HOLPV nlopt")
 _IN_PICTURE = ("LPV", "LPV fitted", "HOLPV", "HOLPV fitted")
 _IN_README = ("HOLPV", "HOLPV fitted")
+_README_DPI = 110  # keeps the file small
 _PRESENTATION = ("difflpv/cli/", "difflpv/demo/", "difflpv/report/")  # sources that change no fit
 Progress = Callable[[str], object]
 
@@ -71,7 +72,7 @@ def run_demo(
         KeyboardInterrupt: passed on; the same call goes on where it stopped.
         OSError: a file cannot be written.
     """
-    begun = time.perf_counter()
+    begun, begun_at = time.perf_counter(), time.time()
     sizes = settings or (DemoSettings.quick() if quick else DemoSettings())
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
@@ -82,7 +83,6 @@ def run_demo(
         progress(f"{done.table}\n\nfinished before; report: {done.report}")
         return done
     count = workers or _processors()
-    resumed = any(folder.glob("fits/*/fitted.json")) or (folder / "targets" / "manifest.json").is_file()
 
     scene = load_scene(SCENE)
     sets = load_light_sets(None, SCENE)[: max(sizes.lights) + 1]
@@ -141,7 +141,7 @@ def run_demo(
         "scores": [score.to_json() for score in scores],
         "fits": fits,
         "machine": describe_machine(),
-        "resumed": resumed,
+        "resumed": any(path.stat().st_mtime < begun_at for path in _made(folder)),
         "identity": identity,
         "seconds": 0.0,
     }
@@ -151,6 +151,11 @@ def run_demo(
     summary = DemoSummary.read(folder)
     progress(f"\n{summary.table}\n\nreport: {summary.report} ({values['seconds']:.0f} s)")
     return summary
+
+
+def _made(folder: Path) -> list[Path]:
+    """The last file of each costly part."""
+    return [folder / "targets" / "manifest.json", *(folder / "fits" / plan.folder / "fitted.json" for plan in FITS)]
 
 
 def _processors() -> int:
@@ -213,7 +218,7 @@ def _draw(values: Mapping[str, Any], views: Views) -> dict[str, bytes]:
         "convergence": draw_convergence(values["fits"], constant),
         "lights": draw_lights(bounce, values["train"], values["test"], values["targets"]["noise"]["bounce1"]["test"]),
         "factors": draw_factors({n: fit["factors"] for n, fit in values["fits"].items() if n.endswith("fitted")}),
-        "cornell": draw_renders(views.truth, few, views.hit, few_captions),
+        "cornell": draw_renders(views.truth, few, views.hit, few_captions, dpi=_README_DPI),
     }
 
 

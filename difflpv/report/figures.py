@@ -22,6 +22,7 @@ __all__ = ["draw_convergence", "draw_factors", "draw_lights", "draw_renders"]
 _DPI = 150
 _CELL = 2.35  # width of a picture [inches]
 _SIGNED = "RdBu_r"
+_ERROR_RANGE = 2.0  # of the error maps, in means of the path-traced image
 # Okabe and Ito's palette, which colour-blind readers can tell apart: one hue per method, nlopt lighter and dashed.
 _COLORS = {
     "constant": "#777777",
@@ -42,6 +43,8 @@ def draw_renders(
     predicted: Mapping[str, np.ndarray],
     hit: np.ndarray,
     captions: Mapping[str, str],
+    *,
+    dpi: int = _DPI,
 ) -> bytes:
     """The path-traced image beside predictions, all under its exposure, and the signed error beneath each prediction.
 
@@ -49,7 +52,8 @@ def draw_renders(
         truth: path traced, linear [H,W,3].
         predicted: linear [H,W,3] by name.
         hit: pixels that see a surface, [H,W] bool; the others are masked in the error maps.
-        captions: a line beneath each prediction's name.
+        captions: a line beneath each error map.
+        dpi: pixels per inch; a picture is 2.35 inches wide.
     """
     from matplotlib.colors import Normalize
 
@@ -57,7 +61,7 @@ def draw_renders(
     mean = float(truth[hit].mean()) if hit.any() else 0.0
     height, width = hit.shape
     columns = 1 + len(predicted)
-    figure = _figure(_CELL * columns, 2 * 0.97 * _CELL * height / width + 0.7)
+    figure = _figure(_CELL * columns, 2 * 0.97 * _CELL * height / width + 0.7, dpi=dpi)
     axes = figure.subplots(2, columns, squeeze=False)
     for axis in axes.ravel():
         axis.set(xticks=[], yticks=[])
@@ -65,7 +69,7 @@ def draw_renders(
     for axis, name, image in zip(axes[0], ["path traced", *predicted], [truth, *predicted.values()], strict=True):
         axis.imshow(tone_map(image, exposure=exposure), interpolation="lanczos")
         axis.set_title(name, fontsize=11)
-    scale = Normalize(-1.0, 1.0)
+    scale = Normalize(-_ERROR_RANGE, _ERROR_RANGE)
     for axis, (name, image) in zip(axes[1, 1:], predicted.items(), strict=True):
         error = np.ma.masked_array((image - truth).mean(2) / (mean or 1.0), mask=~hit)
         axis.set_facecolor("#b8b8b8")
@@ -86,7 +90,8 @@ def _color_bar(axis: Axes, scale: Any, aspect: float) -> None:
     bar = axis.figure.colorbar(
         ScalarMappable(scale, _SIGNED), cax=axis.inset_axes((0.06, 0.5, 0.88, 0.08)), orientation="horizontal", extend="both"
     )
-    bar.set_ticks([-1, -0.5, 0, 0.5, 1], labels=["−1", "−½", "0", "½", "1"])
+    ticks = [share * _ERROR_RANGE for share in (-1, -0.5, 0, 0.5, 1)]
+    bar.set_ticks(ticks, labels=[f"{tick:g}".replace("-", "−") for tick in ticks])
     bar.ax.tick_params(labelsize=9.5)
     axis.text(0.5, 0.2, "times the mean of\nthe path-traced image", ha="center", fontsize=9.5, color="#333333")
 
@@ -210,10 +215,10 @@ def draw_factors(factors: Mapping[str, Sequence[float]]) -> bytes:
     return _png(figure)
 
 
-def _figure(width: float, height: float) -> Figure:
+def _figure(width: float, height: float, *, dpi: int = _DPI) -> Figure:
     from matplotlib.figure import Figure
 
-    return Figure(figsize=(width, height), dpi=_DPI, layout="constrained", facecolor="white")
+    return Figure(figsize=(width, height), dpi=dpi, layout="constrained", facecolor="white")
 
 
 def _row(figure: Figure, count: int, *, sharey: bool = False) -> list[Axes]:

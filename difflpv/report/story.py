@@ -88,16 +88,14 @@ def limits(values: Mapping[str, Any]) -> list[str]:
         name, row = f"{method} fitted", rows.get(f"{method} fitted")
         if row is None:
             continue
-        by_light = {
-            s["light"]: s["relative_l2"]
-            for s in values["scores"]
-            if s["method"] == name and s["component"] == "bounce1" and s["light"] in values["test"]
-        }
+        by_light = {k: _under(values, name, k) for k in values["test"]}
         worst = max(by_light, key=lambda k: by_light[k])
         far = f", {row['relative_l2'] / noise:.0f} times the noise of the targets" if noise > 0 else ""
+        beaten = [k for k in (*values["train"], *values["test"]) if _under(values, name, k) > _under(values, "constant", k)]
+        lost = f" A constant beats it under light{'s' * (len(beaten) > 1)} {_listed(beaten)}." if beaten else ""
         lines.append(
             f"{name}: {row['relative_l2']:.3f} on the test lights{far}; one point in twenty is off by more than "
-            f"{row['percentile_95']:.2f} times the mean irradiance; worst under light {worst} ({by_light[worst]:.3f})."
+            f"{row['percentile_95']:.2f} times the mean irradiance; worst under light {worst} ({by_light[worst]:.3f}).{lost}"
         )
     above = {n: f["factors"] for n, f in values["fits"].items() if n.endswith("fitted") and max(f["factors"]) > 1}
     if above:
@@ -123,6 +121,12 @@ def _test_errors(values: Mapping[str, Any]) -> dict[str, float]:
 
 def _test_row(values: Mapping[str, Any], method: str) -> Mapping[str, float]:
     return next(r["test"] for r in values["rows"] if (r["component"], r["method"]) == ("bounce1", method))
+
+
+def _under(values: Mapping[str, Any], method: str, light: int) -> float:
+    """Error of the first bounce under one light."""
+    found = (s for s in values["scores"] if (s["component"], s["method"], s["light"]) == ("bounce1", method, light))
+    return next(found)["relative_l2"]
 
 
 def _value(value: Any) -> str:
