@@ -91,6 +91,7 @@ def light_target(
     seed: int = 0,
     dtype: torch.dtype = torch.float32,
     device: torch.device | str = "cpu",
+    **options: Any,
 ) -> LightTarget:
     """Trace one light set and put its truth beside it.
 
@@ -109,9 +110,10 @@ def light_target(
         seed: of the light samples.
         dtype: float32 to run, float64 to check.
         device: where to solve.
+        **options: of ``illuminate``, such as its sample counts.
     """
     lit = scene if entries is None else apply_light_set(scene, entries)
-    illumination = illuminate(lit, grid, config, component, seed=seed, dtype=dtype, device=device)
+    illumination = illuminate(lit, grid, config, component, seed=seed, dtype=dtype, device=device, **options)
 
     def tensor(values: np.ndarray) -> torch.Tensor:
         return torch.as_tensor(np.asarray(values, np.float64), dtype=dtype, device=device)
@@ -163,7 +165,8 @@ def fit(
         The fitted model with its scores; an interrupted or failed fit returns the best so far.
 
     Raises:
-        ValueError: an empty or overlapping split, a light without a target, or lights learned on several light sets.
+        ValueError: an empty or overlapping split, a light without a target, lights learned on several light sets, or
+            albedo learned from the component "direct".
     """
     by_index = {t.index: t for t in targets}
     missing = sorted({*train, *test} - set(by_index))
@@ -177,6 +180,8 @@ def fit(
     if lights and len(train) + len(test) > 1:
         raise ValueError(f"learn: {', '.join(lights)} belong to one light set: train on one and test on none")
     learned_on = [by_index[k] for k in train]
+    if "albedo" in learn and learned_on[0].illumination.component == "direct":
+        raise ValueError("learn: 'albedo' has no part in component 'direct', fit it to 'bounce1'")
     lpv = Lpv(learned_on[0].illumination.grid, config, learn=learn, scene=learned_on[0].illumination.scene)
     measure = _image_loss(loss, learned_on) if loss.startswith("image") else _irradiance_loss(loss, learned_on)
 

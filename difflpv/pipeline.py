@@ -140,7 +140,7 @@ class Lpv(torch.nn.Module):
         if direct is not None:
             irradiance = irradiance + direct
         if not torch.compiler.is_compiling() and not bool(irradiance.isfinite().all()):
-            raise FloatingPointError(self._not_finite(v))
+            raise FloatingPointError(self._not_finite({name: value.detach() for name, value in v.items()}))
         return irradiance
 
     def accumulate(self, illumination: Illumination, values: Mapping[str, torch.Tensor] | None = None) -> torch.Tensor:

@@ -59,7 +59,8 @@ def test_mean_over_lights_of_one_method_only():
 
 
 def test_table():
-    lines = format_scores([Score("holpv fitted", "direct", 3, *(0.25,) * 5), Score("m", "bounce1", -1, *(1.0,) * 5)]).splitlines()
+    scores = [Score("holpv fitted", "direct", 3, *(0.25,) * 5), Score("m", "bounce1", -1, *(1.0,) * 5)]
+    lines = format_scores(scores).splitlines()
     assert len(lines) == 3 and lines[0].startswith("method") and "0.250" in lines[1]
     assert lines[1].split()[:4] == ["holpv", "fitted", "direct", "3"] and lines[2].split()[:3] == ["m", "bounce1", "mean"]
     assert len({len(line) for line in lines}) == 1

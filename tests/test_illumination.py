@@ -27,7 +27,7 @@ def closed_room(albedo=0.5):
     return Scene("room", (*box.meshes, panel), (AreaLight("panel", np.array([3.0, 2.0, 1.0])),))
 
 
-def test_direct_area_light_carries_pi_L_A():
+def test_direct_area_light_carries_pi_times_radiance_times_area():
     vpls = lit(closed_room(), "direct").vpls()
     torch.testing.assert_close(vpls.flux.sum(0), torch.tensor([3.0, 2, 1], dtype=torch.float64) * math.pi * 0.16)
     assert (vpls.normal[:, 1] == -1).all()
