@@ -19,7 +19,7 @@ from difflpv.cli.options import UsageError
 
 __all__ = ["COMMANDS", "main"]
 
-COMMANDS = ("targets", "simulate", "fit", "evaluate", "render", "info", "train_stencil")
+COMMANDS = ("targets", "simulate", "fit", "evaluate", "render", "info", "demo", "train_stencil")
 _INTERRUPTED = 130
 _CLOSED_PIPE = 141  # what a shell reports for a program that SIGPIPE ended
 
@@ -34,7 +34,7 @@ class _Parser(argparse.ArgumentParser):
 def _build() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="difflpv",
-        description="Differentiable light propagation volumes: path-traced targets, LPV and HOLPV solves, fits.",
+        description="Differentiable light propagation volumes: path-traced targets, LPV and HOLPV solves, fits to them.",
         epilog="example:\n"
         "  difflpv targets cornell --lights bundled --receivers 2000 --workers 2 --out out/targets\n"
         "  difflpv fit cornell --targets out/targets --learn propagation,sampling_bias --out out/fit\n"

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from difflpv.cli.options import (
     COMPONENTS,
+    METHODS,
     UsageError,
     add_command,
     add_device,
@@ -88,7 +89,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--seconds", type=positive_float, metavar="S", help="wall-time limit (default: none)")
     parser.add_argument("--lr", type=positive_float, metavar="X", help="step size of --solver adam (default: 0.05)")
     parser.add_argument("--overwrite", action="store_true", help="start anew instead of going on from DIR's checkpoint")
-    add_solve(parser, methods=("lpv", "holpv"), fitted=False)
+    add_solve(parser, methods=tuple(name for name in METHODS if name != "constant"), fitted=False)
     add_device(parser)
     seeded(parser)
     add_output(parser)

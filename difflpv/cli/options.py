@@ -68,7 +68,7 @@ def add_command(subparsers: Any, name: str, run: Any, *, help: str, description:
     parser = subparsers.add_parser(
         name,
         help=help,
-        description=textwrap.fill(description, 100),
+        description=textwrap.fill(description, 100, break_on_hyphens=False),
         epilog=f"example:\n{textwrap.indent(textwrap.dedent(example).strip(), '  ')}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
