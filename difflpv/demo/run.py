@@ -41,7 +41,7 @@ _METHODS: tuple[Method, ...] = ("lpv", "holpv")
 _IN_TABLE = ("constant", "LPV", "LPV fitted", "LPV nlopt", "HOLPV", "HOLPV fitted", "HOLPV nlopt")
 _IN_PICTURE = ("LPV", "LPV fitted", "HOLPV", "HOLPV fitted")
 _IN_README = ("HOLPV", "HOLPV fitted")
-_README_DPI = 110  # keeps the file small
+_README_DPI = 100  # keeps the file small
 _PRESENTATION = ("difflpv/cli/", "difflpv/demo/", "difflpv/report/")  # sources that change no fit
 Progress = Callable[[str], object]
 

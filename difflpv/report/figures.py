@@ -237,7 +237,7 @@ def _title(axis: Axes, text: str) -> None:
 
 def _png(figure: Figure) -> bytes:
     target = io.BytesIO()
-    figure.savefig(target, format="png", metadata={"Software": ""})
+    figure.savefig(target, format="png", metadata={"Software": ""}, pil_kwargs={"optimize": True})
     return target.getvalue()
 
 
