@@ -102,6 +102,13 @@ def test_what_belongs_to_the_volume(name, learn, method):
     check(lpv, loss)
 
 
+@pytest.mark.parametrize("learn", ["propagation", "propagation_steps", "sampling_bias", "light_position", "albedo"])
+@pytest.mark.parametrize("method", ["lpv", "holpv", "learned_9x26"])
+def test_linear_transport_on_convolutions(method, learn):
+    lpv, loss = set_up("point bounce1", [learn], method=method, clamp=False, deposit="trilinear")
+    check(lpv, loss)
+
+
 @pytest.mark.parametrize("method", ["lpv", "holpv"])
 @pytest.mark.parametrize(("model", "strength"), [("exp", 1.0), ("clamp", 0.43)])
 def test_occlusion(model, strength, method):

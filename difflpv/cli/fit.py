@@ -303,10 +303,13 @@ def _peers(
     lpv = outcome.lpv
     method = lpv.config.method
     constant, untuned, fitted = outcome.mean_scores(group)
-    published = Lpv(lpv.grid, LpvConfig(method=method))
-    name = f"{method} as published"
-    alone = [s for t in lights if t.index in group for s in score_lights(t, {name: published}) if s.method == name]
-    return [constant, mean_score(alone), replace(untuned, method=f"{method} untuned"), fitted]
+    peers = [constant, replace(untuned, method=f"{method} untuned"), fitted]
+    if method in ("lpv", "holpv"):
+        published = Lpv(lpv.grid, LpvConfig(method=method))
+        name = f"{method} as published"
+        alone = [s for t in lights if t.index in group for s in score_lights(t, {name: published}) if s.method == name]
+        peers.insert(1, mean_score(alone))
+    return peers
 
 
 def _report(
