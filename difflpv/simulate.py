@@ -46,13 +46,17 @@ def _told(lpv: Lpv, light: Illumination, position: np.ndarray) -> tuple[str, ...
     lines = []
     if lpv.report is not None and float(lpv.report.lost_share) > _LOST_SHARE_TOLD:
         lines.append(
-            f"the grid {lpv.grid.minimum}..{lpv.grid.maximum} m does not contain the scene: "
+            f"the grid {_corner(lpv.grid.minimum)} .. {_corner(lpv.grid.maximum)} m does not contain the scene: "
             f"{int(lpv.report.lost_count)} VPLs with {100 * float(lpv.report.lost_share):.3g} % of the flux are lost"
         )
     outside = int((~lpv.grid.contains(position)).sum())
     if outside:
         lines.append(f"{outside} of {len(position)} receivers lie outside the grid and read its edge cells")
     return tuple(lines)
+
+
+def _corner(values: tuple[float, float, float]) -> str:
+    return "(" + ", ".join(f"{v:.4g}" for v in values) + ")"
 
 
 def simulate(
