@@ -1,6 +1,6 @@
 """Speed of propagation as ratios measured in one run: a step against conv3d, the adjoint against the forward.
 
-    python benchmarks/propagation.py [--cells 32 64] [--steps 32] [--repeats 5] [--device cpu|cuda] [--json OUT]
+    python benchmarks/propagation.py [--cells 32 64] [--steps 32] [--repeats 5] [--device cpu|cuda] [--own-only] [--json OUT]
 
 Peers: torch's conv3d with the equivalent linear weights (channels_last_3d; autograd through it in both layouts) and the best
 vectorised torch formulation of clamp and occlusion that we know (a product to all face fluxes, clamp, occlusion, shifted
@@ -70,8 +70,10 @@ def torch_convolution(volume: torch.Tensor, weight: torch.Tensor, factors: torch
     return total
 
 
-def measure(stencil: FaceStencil, cells: int, steps: int, repeats: int, device: torch.device) -> dict[str, float]:
-    """All ratios of one stencil at one size."""
+def measure(
+    stencil: FaceStencil, cells: int, steps: int, repeats: int, device: torch.device, own_only: bool
+) -> dict[str, float]:
+    """All ratios of one stencil at one size; ``own_only`` leaves out the torch peers, which take minutes at 64^3."""
     generator = torch.Generator().manual_seed(0)
     coeffs = (stencil.l_max + 1) ** 2
     volume = torch.randn(3, coeffs, cells, cells, cells, generator=generator)
@@ -111,34 +113,40 @@ def measure(stencil: FaceStencil, cells: int, steps: int, repeats: int, device: 
         "conv3d forward": conv_forward,
         "torch autograd through conv3d": both(lambda v, p: torch_convolution(v, fast_weight, p)),
         "torch autograd through conv3d, contiguous": both(lambda v, p: torch_convolution(v, weight, p)),
-        "linear forward": forward(clamp=False),
-        "linear both": ours(clamp=False),
+        "linear on conv3d forward": forward(clamp=False, backend="conv3d"),
+        "linear on conv3d both": ours(clamp=False, backend="conv3d"),
         "clamp forward": forward(),
         "clamp both": ours(),
         "clamp+occlusion forward": forward(transmittance=passed),
         "clamp+occlusion both": ours(transmittance=passed),
         "torch faces forward": lambda: torch_faces(volume, stencil, factors, passed),
-        "linear warp forward": forward(clamp=False, backend="warp"),
-        "linear warp both": ours(clamp=False, backend="warp"),
+        "linear forward": forward(clamp=False, backend="warp"),
+        "linear both": ours(clamp=False, backend="warp"),
         "torch faces both": both(lambda v, p: torch_faces(v, stencil, p, passed)),
     }
+    if own_only:
+        calls = {name: call for name, call in calls.items() if not name.startswith("torch")}
     t = interleaved(calls, repeats, device)
     occluded = t["clamp+occlusion forward"]
-    return {
-        **{f"{name} [ms]": 1e3 * seconds for name, seconds in t.items()},
+    table = {f"{name} [ms]": 1e3 * seconds for name, seconds in t.items()}
+    table |= {
         "step with clamp and occlusion / conv3d": occluded / t["conv3d forward"],
         "step with clamp / conv3d": t["clamp forward"] / t["conv3d forward"],
-        "step, linear on Warp / conv3d": t["linear warp forward"] / t["conv3d forward"],
+        "step, linear / conv3d": t["linear forward"] / t["conv3d forward"],
+        "forward+backward / forward, linear on conv3d": t["linear on conv3d both"] / t["linear on conv3d forward"],
         "forward+backward / forward, linear": t["linear both"] / t["linear forward"],
-        "forward+backward / forward, linear on Warp": t["linear warp both"] / t["linear warp forward"],
         "forward+backward / forward, clamp": t["clamp both"] / t["clamp forward"],
         "forward+backward / forward, clamp and occlusion": t["clamp+occlusion both"] / occluded,
-        "autograd through conv3d / ours, linear": t["torch autograd through conv3d"] / t["linear both"],
-        "autograd through conv3d / ours, clamp": t["torch autograd through conv3d"] / t["clamp both"],
-        "  the same, contiguous layout / ours, clamp": t["torch autograd through conv3d, contiguous"] / t["clamp both"],
-        "torch faces / ours, clamp and occlusion, forward": t["torch faces forward"] / occluded,
-        "torch faces / ours, clamp and occlusion, both": t["torch faces both"] / t["clamp+occlusion both"],
     }
+    if not own_only:
+        table |= {
+            "autograd through conv3d / ours, linear": t["torch autograd through conv3d"] / t["linear both"],
+            "autograd through conv3d / ours, clamp": t["torch autograd through conv3d"] / t["clamp both"],
+            "  the same, contiguous layout / ours, clamp": t["torch autograd through conv3d, contiguous"] / t["clamp both"],
+            "torch faces / ours, clamp and occlusion, forward": t["torch faces forward"] / occluded,
+            "torch faces / ours, clamp and occlusion, both": t["torch faces both"] / t["clamp+occlusion both"],
+        }
+    return table
 
 
 def main() -> None:
@@ -147,12 +155,14 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=32)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--own-only", action="store_true", help="leave out the slow torch peers")
     parser.add_argument("--json")
     arguments = parser.parse_args()
     results = {}
     for cells in arguments.cells:
         for stencil in (lpv_stencil(), holpv_stencil()):
-            row = measure(stencil, cells, arguments.steps, arguments.repeats, torch.device(arguments.device))
+            device = torch.device(arguments.device)
+            row = measure(stencil, cells, arguments.steps, arguments.repeats, device, arguments.own_only)
             results[f"{stencil.name} {cells}"] = row
             print(f"{stencil.name} {cells}^3, {arguments.steps} steps, {torch.get_num_threads()} threads")
             for name, value in row.items():

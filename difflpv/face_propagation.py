@@ -74,6 +74,12 @@ class _Layout:
         """Zeroed flat buffer of so many padded scalar fields."""
         return torch.zeros(self.length(fields), dtype=like.dtype, device=like.device)
 
+    def clear_border(self, buffer: torch.Tensor, fields: int) -> None:
+        """Zero what a step does not write of a flat buffer: the rows of the halo and the spare end."""
+        view = buffer[: -self.lanes].view(self.z + 2, self.y + 2, fields, self.pitch)
+        for border in (view[0], view[-1], view[:, 0], view[:, -1], buffer[-self.lanes :]):
+            border.zero_()
+
     def inside(self, buffer: torch.Tensor, fields: int) -> torch.Tensor:
         """View of the cells without halo, shape [fields, n_z, n_y, n_x]."""
         view = buffer[: -self.lanes].view(self.z + 2, self.y + 2, fields, self.pitch)
@@ -202,7 +208,9 @@ def _propagate(
     fields = layout.fields
     steps = _Steps(layout, factors, transmittance, offsets, axis, weights, lobes, clamp, occlude_first_step)
     count = len(factors)
-    states = volume.new_zeros((_slots(count, keep), layout.length(fields)))
+    states = volume.new_empty((_slots(count, keep), layout.length(fields)))
+    for i, state in enumerate(states):  # zeroing all of it would cost as much as a step
+        state.zero_() if i == 0 else layout.clear_border(state, fields)
     scratch = [layout.empty(fields, volume) for _ in range(2 if keep != 1 else 1)]
 
     def home(step: int) -> torch.Tensor:

@@ -1,8 +1,10 @@
 """Propagation of a volume through its grid: all steps in one differentiable op.
 
-``propagate`` picks what is fastest for the stencil and the device: a linear stencil without occlusion runs on torch's
-``conv3d`` with our adjoint (``difflpv.convolution``); the clamp, occlusion and CUDA run on the Warp kernels
-(``warp_kernels.propagation``) through ``difflpv.face_propagation``. Both agree with ``difflpv.reference.propagation``.
+``propagate`` picks what is fastest for the stencil: one matrix per neighbour (a learned stencil) runs on torch's ``conv3d``
+with our adjoint (``difflpv.convolution``), faces run on the Warp kernels (``warp_kernels.propagation``) through
+``difflpv.face_propagation``, with or without clamp and occlusion: their 30 or 54 fluxes are fewer products than the
+convolution's dense matrices (0.6 to 0.8 of its time, benchmarks/propagation.py). Both agree with
+``difflpv.reference.propagation``, and a face stencil's linear part runs on either.
 """
 
 from __future__ import annotations
@@ -52,7 +54,7 @@ def propagate(
             per step, which on CUDA waits for the device.
         checkpoint_every: keep every n-th volume for the backward pass and recompute between them. Default: every volume
             up to 1 GiB, then about the square root of ``steps``. Nothing is kept where nothing needs it.
-        backend: "auto", or force the Warp kernels or ``conv3d``.
+        backend: "auto", or force the Warp kernels or, for a face stencil without clamp and occlusion, ``conv3d``.
 
     Returns:
         Accumulated intensity [W/sr], shape of ``volume``: the sum of S_0 (the injected volume) to S_steps.
@@ -92,10 +94,9 @@ def propagate(
         expected = (len(stencil.offsets), *volume.shape[2:])
         if transmittance.shape != expected:
             raise ValueError(f"transmittance: expected shape {list(expected)}, got {list(transmittance.shape)}")
-    plain = transmittance is None and not clamp
-    if backend == "conv3d" and not plain:
-        raise ValueError("backend: conv3d has neither clamp nor occlusion; use 'auto' or 'warp'")
-    if backend == "conv3d" or (backend == "auto" and plain and volume.device.type == "cpu"):
+    if backend == "conv3d":
+        if transmittance is not None or clamp:
+            raise ValueError("backend: conv3d has neither clamp nor occlusion; use 'auto' or 'warp'")
         return _linear(volume, stencil.linear_part, None, factors, tolerance)
     return propagate_faces(
         volume,

@@ -186,7 +186,7 @@ def test_nothing_is_kept_where_no_gradient_needs_it(generator):
     volume, _, factors = random_problem(lpv_stencil(), (4, 4, 4), 5, generator)
     cases = {
         "light only, linear": (propagate, {"factor": 1.0, "clamp": False, "backend": "warp"}, 0),
-        "light only, conv3d": (propagate, {"factor": 1.0, "clamp": False}, 0),
+        "light only, conv3d": (propagate, {"factor": 1.0, "clamp": False, "backend": "conv3d"}, 0),
         "clamp": (propagate, {"factor": 1.0}, 5),
         "factors": (propagate, {"factor": factors, "clamp": False}, 5),
     }

@@ -98,6 +98,8 @@ _FORWARD = (
                 *(V*)out = value;
                 *(V*)sum = *(const V*)sum + value;
                 for (int lane = x_size - x; lane < LANES; ++lane) out[lane] = sum[lane] = 0;  // keep the halo zero
+                if (x == 0) out[-1] = 0;  // and make it so where ``next`` is fresh memory
+                if (x + LANES >= x_size) out[LANES] = 0;
             }
     }
 """

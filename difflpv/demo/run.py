@@ -14,7 +14,7 @@ from data_gen.load import Targets
 from data_gen.targets import make_targets
 from difflpv.config import LpvConfig, Method, grid_for
 from difflpv.demo.fits import fit_once
-from difflpv.demo.settings import FITS, PUBLISHED, SCENE, DemoSettings
+from difflpv.demo.settings import FITS, SCENE, UNFITTED, DemoSettings
 from difflpv.demo.summary import (
     DemoSummary,
     code_digest,
@@ -37,10 +37,20 @@ from difflpv.scene import Scene
 
 __all__ = ["run_demo"]
 
-_METHODS: tuple[Method, ...] = ("lpv", "holpv")
-_IN_TABLE = ("constant", "LPV", "LPV fitted", "LPV nlopt", "HOLPV", "HOLPV fitted", "HOLPV nlopt")
-_IN_PICTURE = ("LPV", "LPV fitted", "HOLPV", "HOLPV fitted")
-_IN_README = ("HOLPV", "HOLPV fitted")
+_METHODS: tuple[Method, ...] = tuple(UNFITTED.values())
+_IN_TABLE = (
+    "constant",
+    "LPV",
+    "LPV fitted",
+    "LPV nlopt",
+    "HOLPV",
+    "HOLPV fitted",
+    "HOLPV nlopt",
+    "learned_9x26",
+    "learned_9x26 fitted",
+)
+_IN_PICTURE = ("LPV fitted", "HOLPV", "HOLPV fitted", "learned_9x26", "learned_9x26 fitted")
+_IN_README = ("HOLPV", "HOLPV fitted", "learned_9x26 fitted")
 _README_DPI = 100  # keeps the file small
 _PRESENTATION = ("difflpv/cli/", "difflpv/demo/", "difflpv/report/")  # sources that change no fit
 Progress = Callable[[str], object]
@@ -104,7 +114,7 @@ def run_demo(
     traced = {m: _light_targets(scene, targets, sizes.fitted(m), "bounce1", sizes, seed) for m in _METHODS}
 
     grid = grid_for(scene, sizes.cells)
-    models = {name: Lpv(grid, sizes.published(method)) for name, method in PUBLISHED.items()}
+    models = {name: Lpv(grid, sizes.published(method)) for name, method in UNFITTED.items()}
     fits: dict[str, dict[str, Any]] = {}
     fit_identity = {"code": fit_code, "targets": targets.manifest["files"]}
     for plan in FITS:
@@ -123,7 +133,7 @@ def run_demo(
     progress("judging and rendering")
     scores = _judge(models, traced)
     direct = _light_targets(scene, targets, sizes.published("lpv"), "direct", sizes, seed)
-    scores += _judge({name: models[name] for name in PUBLISHED}, {m: direct for m in _METHODS})
+    scores += _judge({name: models[name] for name in UNFITTED}, {m: direct for m in _METHODS})
     lit: dict[str, Illumination] = {method: lights[sizes.image_light].illumination for method, lights in traced.items()}
     views = render_views(lit, {name: models[name] for name in _IN_PICTURE}, sizes, truth, noise)
     values: dict[str, Any] = {
@@ -210,7 +220,7 @@ def _draw(values: Mapping[str, Any], views: Views) -> dict[str, bytes]:
     errors = {s["method"]: s["relative_l2"] for s in bounce if s["light"] == light}
     captions = {name: f"relative error {errors[name]:.2f}" for name in views.predicted}
     constant = next(row["train"]["relative_l2"] for row in values["rows"] if row["method"] == "constant")
-    titles = {"HOLPV": "HOLPV as published", "HOLPV fitted": "HOLPV fitted"}
+    titles = {name: "HOLPV as published" if name == "HOLPV" else name for name in _IN_README}
     few = {titles[name]: views.predicted[name] for name in _IN_README}
     few_captions = {titles[name]: captions[name] for name in _IN_README}
     return {

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from difflpv.config import LpvConfig, Method
+from difflpv.config import LpvConfig, Method, Occlusion
 
-__all__ = ["FITS", "PUBLISHED", "SCENE", "DemoSettings", "FitPlan"]
+__all__ = ["FITS", "SCENE", "UNFITTED", "DemoSettings", "FitPlan"]
 
 SCENE = "cornell"
 
@@ -28,6 +28,7 @@ class DemoSettings:
         steps: propagation steps.
         lpv_budget: forward-equivalents of each fit of an LPV, one being a solve of all train lights.
         holpv_budget: the same for a HOLPV, whose solve takes about twice as long.
+        learned_budget: the same for the learned stencil.
     """
 
     receivers: int = 2000
@@ -42,6 +43,7 @@ class DemoSettings:
     steps: int = 32
     lpv_budget: float = 72.0
     holpv_budget: float = 48.0
+    learned_budget: float = 30.0
 
     def __post_init__(self) -> None:
         if not self.train or self.image_light not in self.test or set(self.train) & set(self.test):
@@ -63,6 +65,7 @@ class DemoSettings:
             steps=16,
             lpv_budget=36.0,
             holpv_budget=24.0,
+            learned_budget=18.0,
         )
 
     @property
@@ -72,15 +75,16 @@ class DemoSettings:
 
     def budget(self, method: Method) -> float:
         """Forward-equivalents of a fit."""
-        return self.lpv_budget if method == "lpv" else self.holpv_budget
+        return {"lpv": self.lpv_budget, "holpv": self.holpv_budget}.get(method, self.learned_budget)
 
     def published(self, method: Method) -> LpvConfig:
-        """The solve as published: no occlusion, light deposited in the nearest cell."""
+        """The solve as published, or as trained in free space: no occlusion, light deposited in the nearest cell."""
         return LpvConfig(method=method, steps=self.steps)
 
     def fitted(self, method: Method) -> LpvConfig:
-        """The solve whose factors are fitted: smooth occlusion and deposit."""
-        return LpvConfig(method=method, steps=self.steps, occlusion="exp", deposit="trilinear")
+        """The solve whose factors are fitted: smooth deposit, and smooth occlusion where the stencil has faces."""
+        occlusion: Occlusion = "exp" if method in ("lpv", "holpv") else "none"
+        return LpvConfig(method=method, steps=self.steps, occlusion=occlusion, deposit="trilinear")
 
 
 @dataclass(frozen=True)
@@ -98,7 +102,7 @@ class FitPlan:
         return self.name.lower().replace(" ", "_")
 
 
-PUBLISHED: dict[str, Method] = {"LPV": "lpv", "HOLPV": "holpv"}
+UNFITTED: dict[str, Method] = {"LPV": "lpv", "HOLPV": "holpv", "learned_9x26": "learned_9x26"}
 _SCALARS = ("propagation", "occlusion", "sampling_bias", "injection_bias")
 # Without gradients, one number per step is out of reach: BOBYQA needs 2 n + 1 solves before its first step.
 FITS: tuple[FitPlan, ...] = (
@@ -106,4 +110,10 @@ FITS: tuple[FitPlan, ...] = (
     FitPlan("LPV nlopt", "lpv", "nlopt-bobyqa", _SCALARS),
     FitPlan("HOLPV fitted", "holpv", "lbfgs", (*_SCALARS, "propagation_steps")),
     FitPlan("HOLPV nlopt", "holpv", "nlopt-bobyqa", _SCALARS),
+    FitPlan(
+        "learned_9x26 fitted",
+        "learned_9x26",
+        "lbfgs",
+        ("propagation", "sampling_bias", "injection_bias", "propagation_steps"),
+    ),
 )

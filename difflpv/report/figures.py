@@ -32,8 +32,11 @@ _COLORS = {
     "HOLPV": "#56b4e9",
     "HOLPV fitted": "#0057a3",
     "HOLPV nlopt": "#8ab6d8",
+    "learned_9x26": "#7fc8a9",
+    "learned_9x26 fitted": "#00795a",
 }
 _MARKERS = {"constant": "_", "LPV": "s", "LPV fitted": "s", "HOLPV": "o", "HOLPV fitted": "o"}
+_MARKERS |= {"learned_9x26": "D", "learned_9x26 fitted": "D"}
 _TICKS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
 _MORE_TICKS = (0.03, 0.04, 0.06, 0.08, 0.15, 0.3, 0.4, 0.6, 0.7, 0.8, 1.2, 1.5, 3.0, 4.0)
 

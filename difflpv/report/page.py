@@ -61,7 +61,7 @@ def build_page(values: Mapping[str, Any], figures: Mapping[str, bytes]) -> str:
         _figure(
             "lights",
             figures,
-            "Open marks: as published. Filled marks: fitted on the train lights. A fit that only remembered its lights "
+            "Open marks: before any fit. Filled marks: fitted on the train lights. A fit that only remembered its lights "
             "would be better on the left than on the right.",
             "Error under each light",
         ),
@@ -78,7 +78,8 @@ def build_page(values: Mapping[str, Any], figures: Mapping[str, bytes]) -> str:
         f"<ul>{''.join(f'<li>{line}</li>' for line in limits(values))}</ul>",
         "<h2>Direct light through the volume</h2>",
         "<p>The same test for light that comes straight from the lights (each light’s surface is put into the volume as "
-        "virtual point lights). Nothing was fitted here: these are the kernels as published.</p>",
+        "virtual point lights). Nothing was fitted here: these are the kernels as published, and the learned one as trained in "
+        "free space.</p>",
         _table(direct, noise["direct"], values),
         "<h2>How to reproduce this</h2>",
         _reproduce(values),
