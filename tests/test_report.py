@@ -57,7 +57,7 @@ def summary(errors=(0.6, 2.0, 0.5, 0.55, 0.8, 0.31, 0.4)):
         "scene": "cornell",
         "quick": False,
         "seed": 3,
-        "settings": {"cells": 8, "steps": 3, "image_light": 2, "lpv_budget": 9.0, "holpv_budget": 6.0},
+        "settings": {"cells": 8, "steps": 3, "image_light": 2, "lpv_budget": 9.0, "holpv_budget": 6.0, "learned_budget": 6.0},
         "train": [0, 1],
         "test": [2, 3],
         "targets": {"receivers": 10, "spp": 32, "rays": 12345678, "processor_seconds": 3.0, "noise": noise},

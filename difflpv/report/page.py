@@ -125,8 +125,9 @@ def _convergence_words(values: Mapping[str, Any]) -> str:
     return (
         "Lines: the best loss so far; dots: every evaluation, at the upper edge where it is off the scale. A gradient "
         f"counts as three forward-equivalents, a loss alone as one. Each LPV fit may spend {sizes['lpv_budget']:g}, each "
-        f"HOLPV fit {sizes['holpv_budget']:g}, as its solve takes about twice as long. Solid: L-BFGS with gradients, over "
-        f"{count['HOLPV fitted']} numbers, one factor for every step among them. Dashed: NLopt’s BOBYQA without gradients, "
+        f"HOLPV fit {sizes['holpv_budget']:g}, as its solve takes about twice as long, and that of the learned stencil "
+        f"{sizes['learned_budget']:g}. Solid: L-BFGS with gradients, over {count['HOLPV fitted']} numbers (one less where "
+        "nothing blocks), one factor for every step among them. Dashed: NLopt’s BOBYQA without gradients, "
         f"over the {count['HOLPV nlopt']} numbers that are no such factors: it needs about two evaluations per number "
         "before its first step."
     )
