@@ -13,7 +13,16 @@ from typing import Any
 import torch
 import warp as wp
 
-__all__ = ["as_warp", "check_float", "launch", "refuse_forward_mode", "refuse_second_derivative", "warp_scalar"]
+__all__ = [
+    "as_warp",
+    "check_float",
+    "launch",
+    "record",
+    "refuse_forward_mode",
+    "refuse_second_derivative",
+    "replay",
+    "warp_scalar",
+]
 
 
 def _init_quietly() -> None:
@@ -69,6 +78,17 @@ def launch(kernel: Any, dim: int | Sequence[int], inputs: Sequence[Any], device:
     stream = wp.stream_from_torch(torch.cuda.current_stream(device)) if device.type == "cuda" else None
     target = None if stream is not None else wp.device_from_torch(device)
     wp.launch(kernel, dim=dim, inputs=arguments, device=target, stream=stream, record_tape=False)
+
+
+def record(kernel: Any, dim: Sequence[int], inputs: Sequence[Any], device: torch.device) -> Any:
+    """A launch to be replayed: ``set_param_at_index_from_ctype`` changes an input, ``replay`` runs it."""
+    target = wp.device_from_torch(device)
+    return wp.launch(kernel, dim=dim, inputs=list(inputs), device=target, record_tape=False, record_cmd=True)
+
+
+def replay(command: Any, device: torch.device) -> None:
+    """Run a recorded launch on torch's current stream."""
+    command.launch(wp.stream_from_torch(torch.cuda.current_stream(device)) if device.type == "cuda" else None)
 
 
 def refuse_forward_mode(name: str, *tensors: torch.Tensor | None) -> None:

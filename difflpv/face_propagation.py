@@ -14,9 +14,8 @@ from typing import Any
 
 import numpy as np
 import torch
-import warp as wp
 
-from difflpv.bridge import as_warp, launch, refuse_second_derivative, warp_scalar
+from difflpv.bridge import as_warp, record, refuse_second_derivative, replay, warp_scalar
 from difflpv.stencil import FaceStencil
 from warp_kernels.propagation import CPU_LANES, adjoint_kernel, forward_kernel
 
@@ -119,6 +118,7 @@ class _Steps:
         self._offsets, self._order, self._transmittance = cells, topology["face"], transmittance.detach()
         self._tensors = {k: v.detach().contiguous().reshape(-1) for k, v in tensors.items()}  # keeps them alive
         self._views = {k: as_warp(v) for k, v in self._tensors.items()}
+        self._commands: dict[tuple[Any, int], list[Any]] = {}  # recorded launches: a generic one costs ten times a replay
 
     @cached_property
     def _leaving(self) -> torch.Tensor:
@@ -178,19 +178,23 @@ class _Steps:
         self._launch(adjoint_kernel(self._scalar, **self._spec(step), **flags), arguments)
 
     def _launch(self, kernel: Any, arguments: list[Any]) -> None:
-        rows = self.layout.rows
-        if self.device.type == "cuda":
-            launch(kernel, (rows, self.layout.x), [*arguments, 0], self.device)
+        """Launch on slabs of rows, one per thread on the CPU; replays what an earlier step recorded."""
+        layout, cuda = self.layout, self.device.type == "cuda"
+        if not layout.rows:
             return
-        kernel.module.load(wp.get_device("cpu"), block_dim=1)  # once, before threads race for it; 1 is what launches use
-        threads = max(1, min(torch.get_num_threads(), rows))
-        bounds = [rows * i // threads for i in range(threads + 1)]
-
-        def slab(i: int) -> None:
-            launch(kernel, (bounds[i + 1] - bounds[i], 1), [*arguments, bounds[i]], self.device)
-
-        waiting = [_pool(threads).submit(slab, i) for i in range(1, threads)]
-        slab(0)
+        threads = 1 if cuda else max(1, min(torch.get_num_threads(), layout.rows))
+        bounds = [layout.rows * i // threads for i in range(threads + 1)]
+        if (kernel, threads) not in self._commands:
+            self._commands[kernel, threads] = [
+                record(kernel, (bounds[i + 1] - bounds[i], layout.x if cuda else 1), [*arguments, bounds[i]], self.device)
+                for i in range(threads)
+            ]
+        commands = self._commands[kernel, threads]
+        for command in commands:
+            for index, value in enumerate(arguments):
+                command.set_param_at_index_from_ctype(index, value)
+        waiting = [_pool(threads).submit(command.launch) for command in commands[1:]]
+        replay(commands[0], self.device)
         for future in waiting:
             future.result()
 
