@@ -108,8 +108,7 @@ class Illumination:
     raycaster: Raycaster
 
     def _punctual(self) -> torch.Tensor:
-        area = torch.tensor([isinstance(light, AreaLight) for light in self.scene.lights], device=self.emitters.kind.device)
-        return ~area[self.emitters.light_index]
+        return ~_of_area_lights(self.scene, self.emitters)
 
     def vpls(self, values: LightValues | None = None) -> Vpls:
         """All virtual point lights of the component; empty where no light needs the volume."""
@@ -202,9 +201,8 @@ def illuminate(
     rsms: tuple[Rsm, ...] = ()
     has_area = any(isinstance(light, AreaLight) for light in scene.lights)
     if component == "bounce1" and has_area:
-        area = torch.tensor([isinstance(light, AreaLight) for light in scene.lights], device=emitters.kind.device)
         lit = sample_surfaces(scene, surface_samples, seed=seed, dtype=dtype, device=device)
-        of_area = emitters.select(area[emitters.light_index])
+        of_area = emitters.select(_of_area_lights(scene, emitters))
         samples, visible = drop_unlit(lit, visibility(lit.position, lit.normal, of_area, raycaster))
     if component == "bounce1" or (blockers == "rsm" and config.occlusion != "none"):
         rsms = tuple(
@@ -233,3 +231,9 @@ def illuminate(
     if component == "direct":
         rsms = ()
     return Illumination(component, scene, grid, emitters, samples, visible, rsms, potential, raycaster)
+
+
+def _of_area_lights(scene: Scene, emitters: Emitters) -> torch.Tensor:
+    """Which emitters sample an area light, bool [m]."""
+    area = torch.tensor([isinstance(light, AreaLight) for light in scene.lights], device=emitters.kind.device)
+    return area[emitters.light_index]

@@ -132,11 +132,10 @@ class Lpv(torch.nn.Module):
             FloatingPointError: the result is not finite.
         """
         v = self._complete(values, receivers.position)
-        lights = LightValues(v.get("light_intensity"), v.get("light_color"), v.get("light_position"), v.get("albedo"))
         irradiance = sample_irradiance(
             self.accumulate(illumination, values), receivers.position, receivers.normal, self.grid, bias=v["sampling_bias"]
         )
-        direct = illumination.punctual_irradiance(receivers, lights)
+        direct = illumination.punctual_irradiance(receivers, _light_values(v))
         if direct is not None:
             irradiance = irradiance + direct
         if not torch.compiler.is_compiling() and not bool(irradiance.isfinite().all()):
@@ -151,9 +150,8 @@ class Lpv(torch.nn.Module):
         if config.occlusion != "none" and illumination.potential is None:
             raise ValueError(f"illumination: made without occlusion, this solve needs '{config.occlusion}'")
         v = self._complete(values, illumination.emitters.position)
-        lights = LightValues(v.get("light_intensity"), v.get("light_color"), v.get("light_position"), v.get("albedo"))
         stencil = config.stencil
-        vpls = illumination.vpls(lights)
+        vpls = illumination.vpls(_light_values(v))
         volume, self.report = inject(
             vpls, self.grid, l_max=stencil.l_max, deposit=config.deposit, bias=v["injection_bias"]
         )
@@ -186,3 +184,9 @@ class Lpv(torch.nn.Module):
         return "irradiance is not finite: check the values " + ", ".join(
             f"{name} = {float(value.max()):.4g}" for name, value in values.items() if value.numel()
         )
+
+
+def _light_values(values: Mapping[str, torch.Tensor]) -> LightValues:
+    return LightValues(
+        values.get("light_intensity"), values.get("light_color"), values.get("light_position"), values.get("albedo")
+    )

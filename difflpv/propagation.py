@@ -16,7 +16,6 @@ import torch
 from difflpv.bridge import check_float, refuse_forward_mode
 from difflpv.convolution import propagate_convolution
 from difflpv.face_propagation import propagate_faces
-from difflpv.sh import degree_of_count
 from difflpv.stencil import FaceStencil, LinearStencil
 
 __all__ = ["Backend", "propagate"]
@@ -71,7 +70,6 @@ def propagate(
         raise ValueError(
             f"volume: stencil '{stencil.name}' has {(stencil.l_max + 1) ** 2} coefficients, got {volume.shape[1]}"
         )
-    degree_of_count(volume.shape[1])
     if isinstance(steps, bool) or not isinstance(steps, int) or steps < 0:
         raise ValueError(f"steps: expected an integer >= 0, got {steps!r}")
     if checkpoint_every is not None and checkpoint_every < 1:
