@@ -138,5 +138,5 @@ def propagate_convolution(
 ) -> torch.Tensor:
     """``difflpv.propagation.propagate`` for a linear stencil; arguments validated there, ``factors`` is [steps]."""
     keep = torch.is_grad_enabled() and (matrices.requires_grad or factors.requires_grad)
-    cells = torch.as_tensor(np.asarray(offsets), device=volume.device)
+    cells = torch.as_tensor(np.array(offsets), device=volume.device)
     return _propagate(volume, cells, matrices.contiguous(), factors.contiguous(), float(tolerance), keep)[0]

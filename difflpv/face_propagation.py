@@ -1,102 +1,29 @@
-"""Face stencils on the Warp kernels: padded buffers, slabs on two threads, checkpoints, and the adjoint sweep.
+"""Face stencils on the Warp kernels of ``warp_kernels.propagation``; buffers, slabs and checkpoints as in ``difflpv.padded``.
 
-Adjoint of A = sum_i S_i with S_{i+1} = F_i(S_i): G_N = Abar, G_i = Abar + (dF_i/dS)^T G_{i+1}, and the volume's gradient
-is G_0. Volumes are kept only where the clamp or a learnable of the propagation needs them.
+Volumes are kept only where the clamp or a learnable of the propagation needs them.
 """
 
 from __future__ import annotations
 
-import math
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import torch
 
-from difflpv.bridge import as_warp, record, refuse_second_derivative, replay, warp_scalar
+from difflpv.bridge import as_warp, refuse_second_derivative, warp_scalar
+from difflpv.padded import Layout, SlabLauncher, kept_volumes, march, steps_back, volumes_between
 from difflpv.stencil import FaceStencil
 from warp_kernels.propagation import CPU_LANES, adjoint_kernel, forward_kernel
 
 __all__ = ["propagate_faces"]
-
-_KEEP_ALL_BYTES = 2**30
-
-
-@lru_cache
-def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="difflpv-slab")
-
-
-@dataclass(frozen=True)
-class _Layout:
-    """Padded buffers of one volume shape; see ``warp_kernels.propagation``."""
-
-    channels: int
-    coeffs: int
-    z: int
-    y: int
-    x: int
-    lanes: int
-
-    @classmethod
-    def of(cls, volume: torch.Tensor) -> _Layout:
-        channels, coeffs, z, y, x = volume.shape
-        return cls(channels, coeffs, z, y, x, 1 if volume.is_cuda else CPU_LANES)
-
-    @property
-    def fields(self) -> int:
-        return self.channels * self.coeffs
-
-    @property
-    def pitch(self) -> int:
-        return -(-self.x // self.lanes) * self.lanes + 2
-
-    @property
-    def group(self) -> int:
-        """Channels that one thread works on together."""
-        return 3 if self.channels % 3 == 0 else 1
-
-    @property
-    def groups(self) -> int:
-        return self.channels // self.group
-
-    @property
-    def rows(self) -> int:
-        return self.groups * self.z * self.y
-
-    def length(self, fields: int) -> int:
-        return (self.z + 2) * (self.y + 2) * fields * self.pitch + self.lanes
-
-    def empty(self, fields: int, like: torch.Tensor) -> torch.Tensor:
-        """Zeroed flat buffer of so many padded scalar fields."""
-        return torch.zeros(self.length(fields), dtype=like.dtype, device=like.device)
-
-    def clear_border(self, buffer: torch.Tensor, fields: int) -> None:
-        """Zero what a step does not write of a flat buffer: the rows of the halo and the spare end."""
-        view = buffer[: -self.lanes].view(self.z + 2, self.y + 2, fields, self.pitch)
-        for border in (view[0], view[-1], view[:, 0], view[:, -1], buffer[-self.lanes :]):
-            border.zero_()
-
-    def inside(self, buffer: torch.Tensor, fields: int) -> torch.Tensor:
-        """View of the cells without halo, shape [fields, n_z, n_y, n_x]."""
-        view = buffer[: -self.lanes].view(self.z + 2, self.y + 2, fields, self.pitch)
-        return view[1:-1, 1:-1, :, 1 : self.x + 1].permute(2, 0, 1, 3)
-
-    def pad(self, field: torch.Tensor, into: torch.Tensor | None = None) -> torch.Tensor:
-        """Flat padded copy of a field [..., n_z, n_y, n_x]."""
-        field = field.detach().reshape(-1, self.z, self.y, self.x)
-        buffer = self.empty(len(field), field) if into is None else into
-        self.inside(buffer, len(field)).copy_(field)
-        return buffer
 
 
 class _Steps:
     """Launches of one solve: constant arguments bound once, the moving buffers given per step."""
 
     def __init__(
-        self, layout: _Layout, factors: torch.Tensor, transmittance: torch.Tensor, offsets: torch.Tensor,
+        self, layout: Layout, factors: torch.Tensor, transmittance: torch.Tensor, offsets: torch.Tensor,
         axis: torch.Tensor, weights: torch.Tensor, lobes: torch.Tensor, clamp: bool, occlude_first_step: bool,
     ) -> None:  # fmt: skip
         self.layout, self.device, self.axes = layout, factors.device, len(lobes)
@@ -118,7 +45,7 @@ class _Steps:
         self._offsets, self._order, self._transmittance = cells, topology["face"], transmittance.detach()
         self._tensors = {k: v.detach().contiguous().reshape(-1) for k, v in tensors.items()}  # keeps them alive
         self._views = {k: as_warp(v) for k, v in self._tensors.items()}
-        self._commands: dict[tuple[Any, int], list[Any]] = {}  # recorded launches: a generic one costs ten times a replay
+        self._launcher = SlabLauncher(self.device)
 
     @cached_property
     def _leaving(self) -> torch.Tensor:
@@ -130,12 +57,9 @@ class _Steps:
         """Padded transmittance at the destination cells, faces in the order of ``face``: what a step reads."""
         if not self.occluded:
             return self._transmittance
-        layout = self.layout
-        buffer = layout.empty(self.faces, self._transmittance)
-        view = buffer[: -layout.lanes].view(layout.z + 2, layout.y + 2, self.faces, layout.pitch)
+        buffer = self.layout.empty(self.faces, self._transmittance)
         for i, f in enumerate(self._order):
-            x, y, z = (int(v) + 1 for v in self._offsets[f])
-            view[z : z + layout.z, y : y + layout.y, i, x : x + layout.x] = self._transmittance[f]
+            self.layout.inside(buffer, self.faces, tuple(self._offsets[f].tolist()))[i] = self._transmittance[f]
         return buffer
 
     def occlude(self, step: int) -> bool:
@@ -178,29 +102,12 @@ class _Steps:
         self._launch(adjoint_kernel(self._scalar, **self._spec(step), **flags), arguments)
 
     def _launch(self, kernel: Any, arguments: list[Any]) -> None:
-        """Launch on slabs of rows, one per thread on the CPU; replays what an earlier step recorded."""
-        layout, cuda = self.layout, self.device.type == "cuda"
-        if not layout.rows:
-            return
-        threads = 1 if cuda else max(1, min(torch.get_num_threads(), layout.rows))
-        bounds = [layout.rows * i // threads for i in range(threads + 1)]
-        if (kernel, threads) not in self._commands:
-            self._commands[kernel, threads] = [
-                record(kernel, (bounds[i + 1] - bounds[i], layout.x if cuda else 1), [*arguments, bounds[i]], self.device)
-                for i in range(threads)
-            ]
-        commands = self._commands[kernel, threads]
-        for command in commands:
-            for index, value in enumerate(arguments):
-                command.set_param_at_index_from_ctype(index, value)
-        waiting = [_pool(threads).submit(command.launch) for command in commands[1:]]
-        replay(commands[0], self.device)
-        for future in waiting:
-            future.result()
+        layout = self.layout
+        self._launcher.launch(kernel, _rows(layout), layout.x if self.device.type == "cuda" else 1, arguments)
 
 
-def _slots(steps: int, keep: int) -> int:
-    return -(-steps // keep) if keep else 0
+def _rows(layout: Layout) -> int:
+    return layout.groups * layout.z * layout.y
 
 
 @torch.library.custom_op("difflpv::propagate_faces", mutates_args=())
@@ -208,38 +115,16 @@ def _propagate(
     volume: torch.Tensor, factors: torch.Tensor, transmittance: torch.Tensor, offsets: torch.Tensor, axis: torch.Tensor,
     weights: torch.Tensor, lobes: torch.Tensor, clamp: bool, occlude_first_step: bool, tolerance: float, keep: int,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
-    layout = _Layout.of(volume)
-    fields = layout.fields
+    layout = Layout.of(volume, CPU_LANES)
     steps = _Steps(layout, factors, transmittance, offsets, axis, weights, lobes, clamp, occlude_first_step)
-    count = len(factors)
-    states = volume.new_empty((_slots(count, keep), layout.length(fields)))
-    for i, state in enumerate(states):  # zeroing all of it would cost as much as a step
-        state.zero_() if i == 0 else layout.clear_border(state, fields)
-    scratch = [layout.empty(fields, volume) for _ in range(2 if keep != 1 else 1)]
-
-    def home(step: int) -> torch.Tensor:
-        kept = keep and step < count and step % keep == 0
-        return states[step // keep] if kept else scratch[step % len(scratch)]
-
-    def flux(buffer: torch.Tensor) -> float:
-        return float(layout.inside(buffer, fields)[:: layout.coeffs].abs().sum())
-
-    total = layout.pad(volume, into=home(0)).clone()
-    injected = flux(home(0)) if tolerance else 0.0
-    done = count
-    for step in range(count):
-        if tolerance and flux(home(step)) <= tolerance * injected:
-            done = step
-            break
-        steps.forward(home(step), home(step + 1), total, step)
-    accumulated = layout.inside(total, fields).reshape(volume.shape).contiguous()
+    accumulated, states, done = march(layout, volume, len(factors), keep, tolerance, steps.forward)
     return accumulated, states, torch.tensor(done)
 
 
 @_propagate.register_fake
 def _(volume, factors, transmittance, offsets, axis, weights, lobes, clamp, occlude_first_step, tolerance, keep):
-    layout = _Layout.of(volume)
-    states = volume.new_empty((_slots(len(factors), keep), layout.length(layout.fields)))
+    layout = Layout.of(volume, CPU_LANES)
+    states = kept_volumes(layout, volume, len(factors), keep)
     return torch.empty_like(volume, memory_format=torch.contiguous_format), states, torch.empty((), dtype=torch.int64)
 
 
@@ -249,39 +134,31 @@ def _propagate_backward(
     transmittance: torch.Tensor, offsets: torch.Tensor, axis: torch.Tensor, weights: torch.Tensor, lobes: torch.Tensor,
     clamp: bool, occlude_first_step: bool, keep: int, need_factors: bool, need_transmittance: bool,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
-    layout = _Layout.of(accumulated_bar)
+    layout = Layout.of(accumulated_bar, CPU_LANES)
     fields = layout.fields
     steps = _Steps(layout, factors, transmittance, offsets, axis, weights, lobes, clamp, occlude_first_step)
     total_bar, volume_bar = layout.pad(accumulated_bar), layout.empty(fields, accumulated_bar)
     lobe_bar = layout.empty(layout.channels * len(lobes), accumulated_bar)
     lobe_bar_next = torch.zeros_like(lobe_bar)
     # the kernel that makes the transmittance's gradient writes the factors' too
-    factor_bar = accumulated_bar.new_zeros(len(factors) * layout.rows if need_factors or need_transmittance else 0)
+    factor_bar = accumulated_bar.new_zeros(len(factors) * _rows(layout) if need_factors or need_transmittance else 0)
     faces = len(transmittance) if need_transmittance else 0
     transmittance_bar = layout.empty(faces, accumulated_bar) if faces else accumulated_bar.new_empty(0)
-    segment = [layout.empty(fields, accumulated_bar) for _ in range(min(keep, len(factors)) - 1)] if keep else []
-    unused = layout.empty(fields, accumulated_bar) if segment else volume_bar
     count = int(done)
     if count == 0:
         volume_bar = total_bar
     else:
         none = accumulated_bar.new_empty(0)
         steps.adjoint(total_bar, lobe_bar_next, lobe_bar, total_bar, volume_bar, none, none, count - 1, start=True)
-    for begin in reversed(range(0, count, keep or count or 1)):
-        end = min(begin + (keep or count), count)
-        volumes = [states[begin // keep], *segment] if keep else [total_bar] * count
-        for i in range(end - begin - 1 if keep else 0):
-            steps.forward(volumes[i], volumes[i + 1], unused, begin + i)
-        for step in reversed(range(begin, end)):
-            steps.adjoint(
-                volumes[step - begin], lobe_bar, lobe_bar_next, total_bar, volume_bar, transmittance_bar, factor_bar, step
-            )
-            lobe_bar, lobe_bar_next = lobe_bar_next, lobe_bar
+    for step, before in steps_back(layout, states, len(factors), count, keep, steps.forward):
+        moving = total_bar if before is None else before
+        steps.adjoint(moving, lobe_bar, lobe_bar_next, total_bar, volume_bar, transmittance_bar, factor_bar, step)
+        lobe_bar, lobe_bar_next = lobe_bar_next, lobe_bar
     volume_bar = layout.inside(volume_bar, fields).reshape(accumulated_bar.shape).contiguous()
     if faces:
         transmittance_bar = layout.inside(transmittance_bar, faces).contiguous()
     if need_factors:
-        factor_bar = factor_bar.view(len(factors), layout.rows).sum(1)
+        factor_bar = factor_bar.view(len(factors), _rows(layout)).sum(1)
     else:
         factor_bar = accumulated_bar.new_empty(0)
     return volume_bar, factor_bar, transmittance_bar
@@ -341,10 +218,7 @@ def propagate_faces(
     needs = learned or (clamp and torch.is_grad_enabled() and volume.requires_grad)
     keep = 0
     if needs and len(factors):
-        layout = _Layout.of(volume)
-        bytes_a_step = layout.length(layout.fields) * volume.element_size()
-        every = 1 if len(factors) * bytes_a_step <= _KEEP_ALL_BYTES else math.isqrt(len(factors))
-        keep = checkpoint_every or every
+        keep = volumes_between(Layout.of(volume, CPU_LANES), volume, len(factors), checkpoint_every)
     lobes, axis = stencil.distinct_lobes
 
     def tensor(values: np.ndarray) -> torch.Tensor:

@@ -1,10 +1,10 @@
 """Propagation of a volume through its grid: all steps in one differentiable op.
 
 ``propagate`` picks what is fastest for the stencil: one matrix per neighbour (a learned stencil) runs on torch's ``conv3d``
-with our adjoint (``difflpv.convolution``), faces run on the Warp kernels (``warp_kernels.propagation``) through
-``difflpv.face_propagation``, with or without clamp and occlusion: their 30 or 54 fluxes are fewer products than the
-convolution's dense matrices (0.6 to 0.8 of its time, benchmarks/propagation.py). Both agree with
-``difflpv.reference.propagation``, and a face stencil's linear part runs on either.
+with our adjoint (``difflpv.convolution``) or, with occlusion, on Warp kernels (``difflpv.linear_propagation``); faces run on
+the Warp kernels of ``difflpv.face_propagation``, with or without clamp and occlusion: their 30 or 54 fluxes are fewer products
+than the convolution's dense matrices (0.6 to 0.8 of its time, benchmarks/propagation.py). All agree with
+``difflpv.reference.propagation``, and a face stencil's linear part runs on any of them.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import torch
 from difflpv.bridge import check_float, refuse_forward_mode
 from difflpv.convolution import propagate_convolution
 from difflpv.face_propagation import propagate_faces
+from difflpv.linear_propagation import propagate_pairs
 from difflpv.stencil import FaceStencil, LinearStencil
 
 __all__ = ["Backend", "propagate"]
@@ -44,8 +45,10 @@ def propagate(
         stencil: LPV, HOLPV or a linear stencil; K must be its coefficient count.
         steps: number of steps, >= 0.
         factor: propagation factor p, a number, a 0-d tensor or one per step [steps]. Learnable.
-        transmittance: share of each face's flux that passes, at the source cell, shape [F, n_z, n_y, n_x] (see
-            ``difflpv.occlusion.transmittance``). Learnable. Face stencils only.
+        transmittance: share of the light that passes. Learnable. Face stencils: of each face's flux, at the source cell,
+            shape [F, n_z, n_y, n_x] (see ``difflpv.occlusion.transmittance``). Linear stencils: between cells c and c + n,
+            both ways, at c, for each of the P pairs n of ``difflpv.stencil.pair_offsets``, shape [P, n_z, n_y, n_x]; what
+            stands there for cells c + n outside the grid is ignored.
         occlude_first_step: the publications leave the first step unoccluded (self-shadowing); True occludes it too.
         clamp: negative intensity carries no flux. Default True for face stencils; linear ones have none.
         matrices: learnable replacement [n,K,K] for a linear stencil's matrices.
@@ -53,7 +56,7 @@ def propagate(
             per step, which on CUDA waits for the device.
         checkpoint_every: keep every n-th volume for the backward pass and recompute between them. Default: every volume
             up to 1 GiB, then about the square root of ``steps``. Nothing is kept where nothing needs it.
-        backend: "auto", or force the Warp kernels or, for a face stencil without clamp and occlusion, ``conv3d``.
+        backend: "auto", or force the Warp kernels or, without clamp and occlusion, ``conv3d``.
 
     Returns:
         Accumulated intensity [W/sr], shape of ``volume``: the sum of S_0 (the injected volume) to S_steps.
@@ -79,23 +82,20 @@ def propagate(
     refuse_forward_mode("propagate", volume, transmittance, matrices, factor if isinstance(factor, torch.Tensor) else None)
     factors = _factors(factor, steps, volume)
     if isinstance(stencil, LinearStencil):
-        if transmittance is not None or clamp:
-            raise ValueError(f"stencil '{stencil.name}' is linear: it takes neither transmittance nor clamp")
-        if backend == "warp":
-            raise ValueError(f"backend: a linear stencil runs on conv3d, got {backend!r}")
-        return _linear(volume, stencil, matrices, factors, tolerance)
+        if clamp:
+            raise ValueError(f"clamp: stencil '{stencil.name}' is linear, it has none")
+        return _linear(
+            volume, stencil, matrices, factors, transmittance, occlude_first_step=occlude_first_step, tolerance=tolerance,
+            checkpoint_every=checkpoint_every, backend=backend,
+        )  # fmt: skip
     if matrices is not None:
         raise ValueError(f"matrices: only a linear stencil takes them, got a face stencil '{stencil.name}'")
     clamp = True if clamp is None else clamp
-    if transmittance is not None:
-        check_float("transmittance", transmittance, like=volume)
-        expected = (len(stencil.offsets), *volume.shape[2:])
-        if transmittance.shape != expected:
-            raise ValueError(f"transmittance: expected shape {list(expected)}, got {list(transmittance.shape)}")
+    _check_transmittance(transmittance, len(stencil.offsets), volume)
     if backend == "conv3d":
         if transmittance is not None or clamp:
             raise ValueError("backend: conv3d has neither clamp nor occlusion; use 'auto' or 'warp'")
-        return _linear(volume, stencil.linear_part, None, factors, tolerance)
+        return _linear(volume, stencil.linear_part, None, factors, None, tolerance=tolerance, backend=backend)
     return propagate_faces(
         volume,
         stencil,
@@ -117,12 +117,40 @@ def _factors(factor: float | torch.Tensor, steps: int, volume: torch.Tensor) -> 
     return factor.expand(steps)
 
 
+def _check_transmittance(transmittance: torch.Tensor | None, fields: int, volume: torch.Tensor) -> None:
+    if transmittance is None:
+        return
+    check_float("transmittance", transmittance, like=volume)
+    expected = (fields, *volume.shape[2:])
+    if transmittance.shape != expected:
+        raise ValueError(f"transmittance: expected shape {list(expected)}, got {list(transmittance.shape)}")
+
+
 def _linear(
-    volume: torch.Tensor, stencil: LinearStencil, matrices: torch.Tensor | None, factors: torch.Tensor, tolerance: float
-) -> torch.Tensor:
+    volume: torch.Tensor, stencil: LinearStencil, matrices: torch.Tensor | None, factors: torch.Tensor,
+    transmittance: torch.Tensor | None, *, occlude_first_step: bool = False, tolerance: float,
+    checkpoint_every: int | None = None, backend: Backend,
+) -> torch.Tensor:  # fmt: skip
     if matrices is None:
         matrices = torch.as_tensor(stencil.matrices, dtype=volume.dtype, device=volume.device)
     check_float("matrices", matrices, like=volume)
     if matrices.shape != stencil.matrices.shape:
         raise ValueError(f"matrices: expected shape {list(stencil.matrices.shape)}, got {list(matrices.shape)}")
-    return propagate_convolution(volume, stencil.offsets, matrices, factors, tolerance=tolerance)
+    if transmittance is not None:
+        if stencil.one_way:
+            raise ValueError(f"transmittance: stencil '{stencil.name}' lacks the opposite of offset {list(stencil.one_way[0])}")
+        _check_transmittance(transmittance, stencil.pair_count, volume)
+        if backend == "conv3d":
+            raise ValueError("backend: conv3d has no occlusion; use 'auto' or 'warp'")
+    if backend == "conv3d" or (backend == "auto" and transmittance is None and not volume.is_cuda):
+        return propagate_convolution(volume, stencil.offsets, matrices, factors, tolerance=tolerance)
+    return propagate_pairs(
+        volume,
+        stencil.offsets,
+        matrices,
+        factors,
+        transmittance,
+        occlude_first_step=occlude_first_step,
+        tolerance=tolerance,
+        checkpoint_every=checkpoint_every,
+    )

@@ -13,7 +13,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import Literal
 
@@ -28,6 +28,7 @@ __all__ = [
     "Reprojection",
     "holpv_stencil",
     "lpv_stencil",
+    "pair_offsets",
     "square_solid_angle",
 ]
 
@@ -43,11 +44,15 @@ class LinearStencil:
         name: short name for tables and files.
         offsets: destination minus source cell (x, y, z), shape [n,3] int.
         matrices: shape [n, K, K] float64.
+        pair_count: number P of pairs of cells that it connects, see ``pair_offsets``.
+        one_way: offsets whose opposite it lacks; occlusion needs both.
     """
 
     name: str
     offsets: np.ndarray
     matrices: np.ndarray
+    pair_count: int = field(init=False)
+    one_way: tuple[tuple[int, ...], ...] = field(init=False)
 
     def __post_init__(self) -> None:
         offsets, matrices = np.asarray(self.offsets), np.asarray(self.matrices)
@@ -60,6 +65,10 @@ class LinearStencil:
         if not np.isfinite(matrices).all():
             raise ValueError("matrices: expected finite numbers, got NaN or infinity")
         degree_of_count(matrices.shape[1])
+        cells = [tuple(n) for n in offsets.tolist()]
+        # plain numbers, here and not where they are used, so that torch.compile can trace what uses them
+        object.__setattr__(self, "pair_count", len(pair_offsets(offsets)))
+        object.__setattr__(self, "one_way", tuple(n for n in cells if tuple(-step for step in n) not in cells))
 
     @property
     def l_max(self) -> int:
@@ -69,6 +78,23 @@ class LinearStencil:
     def uniform_gain(self) -> np.ndarray:
         """Sum of all matrices [K,K]: what one step does to a field that is the same in every cell."""
         return np.asarray(self.matrices).sum(0)
+
+
+def pair_offsets(offsets: np.ndarray) -> np.ndarray:
+    """The pairs of cells that a stencil connects: its offsets n > (0, 0, 0), shape [P,3], P = 13 (26 neighbours) or 3 (6).
+
+    A transmittance [P, n_z, n_y, n_x] of a linear stencil follows this order: its value at cell c is the share that passes
+    between c and c + n, both ways.
+
+    Args:
+        offsets: destination minus source cell (x, y, z), shape [n,3] int; either of n and -n suffices.
+
+    Returns:
+        Lexicographic in (x, y, z), shape [P,3] int.
+    """
+    cells = [tuple(n) for n in np.asarray(offsets).tolist()]
+    ahead = {max(n, (-n[0], -n[1], -n[2])) for n in cells} - {(0, 0, 0)}
+    return np.array(sorted(ahead), dtype=np.int64).reshape(-1, 3)
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,13 +6,20 @@ import warp as wp
 from difflpv import bridge
 from warp_kernels.direct import direct_kernels
 from warp_kernels.injection import injection_kernels
+from warp_kernels.linear_propagation import matrices_kernel, step_kernel
 from warp_kernels.occlusion import occlusion_kernels
 from warp_kernels.propagation import adjoint_kernel, forward_kernel
 from warp_kernels.rsm import rsm_kernels
 from warp_kernels.sampling import sampling_kernels
 
 FACES = {"coeffs": 9, "axes": 6, "channels": 3, "lanes": 1, "clamp": True, "occluded": True}
+PAIRS = {"coeffs": 9, "channels": 3, "lanes": 1, "occluded": True}
 KERNELS = {
+    "linear propagation": lambda s: step_kernel(s, **PAIRS, paired=True),
+    "linear propagation adjoint": lambda s: step_kernel(
+        s, **PAIRS, paired=False, adjoint=True, need_factor=True, need_transmittance=True
+    ),
+    "linear propagation matrices": lambda s: matrices_kernel(s, **PAIRS),
     "propagation": lambda s: forward_kernel(s, **FACES),
     "propagation adjoint": lambda s: adjoint_kernel(s, **FACES, need_factor=True, need_transmittance=True),
     "direct": lambda s: direct_kernels(s)[0],

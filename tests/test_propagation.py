@@ -261,7 +261,7 @@ MESSAGES = [
      lambda v: propagate(v, lpv_stencil(), steps=2, transmittance=torch.ones(30, 2, 2, 2).double())),
     (ValueError, "backend: conv3d has neither clamp nor occlusion",
      lambda v: propagate(v, lpv_stencil(), steps=2, backend="conv3d")),
-    (ValueError, "stencil 'lpv' is linear: it takes neither transmittance nor clamp",
+    (ValueError, "clamp: stencil 'lpv' is linear, it has none",
      lambda v: propagate(v, lpv_stencil().linear_part, steps=2, clamp=True)),
     (ValueError, "matrices: only a linear stencil takes them",
      lambda v: propagate(v, lpv_stencil(), steps=2, matrices=torch.ones(6, 4, 4))),

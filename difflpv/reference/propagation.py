@@ -62,12 +62,41 @@ def propagate_faces(
 
 
 def propagate_linear(
-    volume: torch.Tensor, offsets: list[tuple[int, int, int]], matrices: torch.Tensor, factors: torch.Tensor
+    volume: torch.Tensor,
+    offsets: list[tuple[int, int, int]],
+    matrices: torch.Tensor,
+    factors: torch.Tensor,
+    transmittance: torch.Tensor | None = None,
+    *,
+    occlude_first_step: bool = False,
 ) -> torch.Tensor:
-    """Accumulate ``len(factors)`` steps of a linear stencil: ``matrices`` [n,K,K], destination from source."""
+    """Accumulate ``len(factors)`` steps of a linear stencil: ``matrices`` [n,K,K], destination from source.
+
+    Args:
+        volume: injected intensity [W/sr], shape [C, K, n_z, n_y, n_x].
+        offsets: destination minus source cell (x, y, z) of each matrix.
+        matrices: shape [n,K,K].
+        factors: propagation factor of each step, shape [steps].
+        transmittance: share that passes between c and c + n, at c, for every offset n > (0, 0, 0) in lexicographic order,
+            shape [P, n_z, n_y, n_x], or None.
+        occlude_first_step: apply ``transmittance`` to the first step too.
+
+    Returns:
+        Sum of the injected volume and all steps, same shape.
+    """
+    ahead = sorted(n for n in offsets if n > (0, 0, 0))
     moving = accumulated = volume
-    for factor in factors:
-        products = torch.einsum("nij,cjzyx->ncizyx", matrices, moving)
-        moving = factor * sum(shift_cells(products[i], offset) for i, offset in enumerate(offsets))
+    for step, factor in enumerate(factors):
+        arrived = torch.zeros_like(volume)
+        for offset, matrix in zip(offsets, matrices, strict=True):
+            sent = torch.einsum("ij,cjzyx->cizyx", matrix, moving)
+            back = (-offset[0], -offset[1], -offset[2])
+            if transmittance is None or offset == back or (step == 0 and not occlude_first_step):
+                arrived = arrived + shift_cells(sent, offset)
+            elif offset in ahead:  # the pair's share lies at the source cell
+                arrived = arrived + shift_cells(sent * transmittance[ahead.index(offset)], offset)
+            else:  # and here at the destination
+                arrived = arrived + shift_cells(sent, offset) * transmittance[ahead.index(back)]
+        moving = factor * arrived
         accumulated = accumulated + moving
     return accumulated

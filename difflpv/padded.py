@@ -1,0 +1,188 @@
+"""Padded buffers of the propagation kernels, their launches on slabs of rows, and the march over steps there and back.
+
+A buffer is flat: rows of cells along x, all fields of a row together, ``[n_z+2, n_y+2, fields, pitch]`` with ``pitch`` =
+ceil(n_x / lanes) lanes + 2 and ``lanes`` spare elements at the end. The halo of one cell is zero, so that kernels need no
+bounds checks and may read ``lanes`` cells at once.
+
+Adjoint of A = sum_i S_i with S_{i+1} = F_i(S_i): G_N = Abar, G_i = Abar + (dF_i/dS)^T G_{i+1}, and the volume's gradient
+is G_0. Volumes are kept only where that derivative or a learnable of the propagation needs them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import torch
+
+from difflpv.bridge import record, replay
+
+__all__ = ["Forward", "Layout", "SlabLauncher", "kept_volumes", "march", "steps_back", "volumes_between"]
+
+# S_{step+1} from S_step, added onto a total: (moving, into, total, step), all flat padded buffers.
+Forward = Callable[[torch.Tensor, torch.Tensor, torch.Tensor, int], None]
+
+_KEEP_ALL_BYTES = 2**30
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Padded buffers of one volume shape."""
+
+    channels: int
+    coeffs: int
+    z: int
+    y: int
+    x: int
+    lanes: int
+
+    @classmethod
+    def of(cls, volume: torch.Tensor, cpu_lanes: int) -> Layout:
+        """Layout of a volume [C, K, n_z, n_y, n_x]; on CUDA a thread has one cell."""
+        channels, coeffs, z, y, x = volume.shape
+        return cls(channels, coeffs, z, y, x, 1 if volume.is_cuda else cpu_lanes)
+
+    @property
+    def fields(self) -> int:
+        """Scalar fields of a volume."""
+        return self.channels * self.coeffs
+
+    @property
+    def pitch(self) -> int:
+        """Elements from one field of a row to the next."""
+        return -(-self.x // self.lanes) * self.lanes + 2
+
+    @property
+    def group(self) -> int:
+        """Channels that one thread works on together."""
+        return 3 if self.channels % 3 == 0 else 1
+
+    @property
+    def groups(self) -> int:
+        """Groups of channels."""
+        return self.channels // self.group
+
+    def length(self, fields: int) -> int:
+        """Elements of a flat buffer of so many fields."""
+        return (self.z + 2) * (self.y + 2) * fields * self.pitch + self.lanes
+
+    def empty(self, fields: int, like: torch.Tensor) -> torch.Tensor:
+        """Zeroed flat buffer of so many padded scalar fields."""
+        return torch.zeros(self.length(fields), dtype=like.dtype, device=like.device)
+
+    def view(self, buffer: torch.Tensor, fields: int) -> torch.Tensor:
+        """View with the halo, shape [n_z + 2, n_y + 2, fields, pitch]."""
+        return buffer[: -self.lanes].view(self.z + 2, self.y + 2, fields, self.pitch)
+
+    def clear_border(self, buffer: torch.Tensor, fields: int) -> None:
+        """Zero what a step does not write of a flat buffer: the rows of the halo and the spare end."""
+        view = self.view(buffer, fields)
+        for border in (view[0], view[-1], view[:, 0], view[:, -1], buffer[-self.lanes :]):
+            border.zero_()
+
+    def inside(self, buffer: torch.Tensor, fields: int, offset: tuple[int, int, int] = (0, 0, 0)) -> torch.Tensor:
+        """View of the cells without halo, shape [fields, n_z, n_y, n_x]; with an offset (x, y, z) of their neighbours there."""
+        x, y, z = (1 + step for step in offset)
+        window = self.view(buffer, fields)[z : z + self.z, y : y + self.y, :, x : x + self.x]
+        return window.permute(2, 0, 1, 3)
+
+    def pad(self, field: torch.Tensor, into: torch.Tensor | None = None) -> torch.Tensor:
+        """Flat padded copy of a field [..., n_z, n_y, n_x]."""
+        field = field.detach().reshape(-1, self.z, self.y, self.x)
+        buffer = self.empty(len(field), field) if into is None else into
+        self.inside(buffer, len(field)).copy_(field)
+        return buffer
+
+
+@lru_cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, thread_name_prefix="difflpv-slab")
+
+
+class SlabLauncher:
+    """Launches a kernel on slabs of its first dimension, one per thread on the CPU; replays what an earlier step recorded."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        self._commands: dict[tuple[Any, int], list[Any]] = {}  # recorded launches: a generic one costs ten times a replay
+
+    def launch(self, kernel: Any, items: int, width: int, arguments: list[Any]) -> None:
+        """Run ``items`` x ``width`` threads; the kernel's last argument is the first item of a slab."""
+        if not items:
+            return
+        threads = 1 if self.device.type == "cuda" else max(1, min(torch.get_num_threads(), items))
+        bounds = [items * i // threads for i in range(threads + 1)]
+        if (kernel, threads) not in self._commands:
+            self._commands[kernel, threads] = [
+                record(kernel, (bounds[i + 1] - bounds[i], width), [*arguments, bounds[i]], self.device)
+                for i in range(threads)
+            ]
+        commands = self._commands[kernel, threads]
+        for command in commands:
+            for index, value in enumerate(arguments):
+                command.set_param_at_index_from_ctype(index, value)
+        waiting = [_pool(threads).submit(command.launch) for command in commands[1:]]
+        replay(commands[0], self.device)
+        for future in waiting:
+            future.result()
+
+
+def volumes_between(layout: Layout, volume: torch.Tensor, steps: int, checkpoint_every: int | None) -> int:
+    """Steps from one kept volume to the next: every step up to 1 GiB, then about the square root of their number."""
+    bytes_a_step = layout.length(layout.fields) * volume.element_size()
+    return checkpoint_every or (1 if steps * bytes_a_step <= _KEEP_ALL_BYTES else math.isqrt(steps))
+
+
+def kept_volumes(layout: Layout, like: torch.Tensor, steps: int, keep: int) -> torch.Tensor:
+    """Uninitialised memory of every ``keep``-th volume (0: of none), shape [slots, length]."""
+    return like.new_empty((-(-steps // keep) if keep else 0, layout.length(layout.fields)))
+
+
+def march(
+    layout: Layout, volume: torch.Tensor, steps: int, keep: int, tolerance: float, forward: Forward
+) -> tuple[torch.Tensor, torch.Tensor, int]:
+    """All steps: accumulated intensity [C, K, n_z, n_y, n_x], the kept volumes, and how many steps were taken."""
+    fields = layout.fields
+    states = kept_volumes(layout, volume, steps, keep)
+    for i, state in enumerate(states):  # zeroing all of it would cost as much as a step
+        state.zero_() if i == 0 else layout.clear_border(state, fields)
+    scratch = [layout.empty(fields, volume) for _ in range(2 if keep != 1 else 1)]
+
+    def home(step: int) -> torch.Tensor:
+        kept = keep and step < steps and step % keep == 0
+        return states[step // keep] if kept else scratch[step % len(scratch)]
+
+    def flux(buffer: torch.Tensor) -> float:
+        return float(layout.inside(buffer, fields)[:: layout.coeffs].abs().sum())
+
+    total = layout.pad(volume, into=home(0)).clone()
+    injected = flux(home(0)) if tolerance else 0.0
+    done = steps
+    for step in range(steps):
+        if tolerance and flux(home(step)) <= tolerance * injected:
+            done = step
+            break
+        forward(home(step), home(step + 1), total, step)
+    return layout.inside(total, fields).reshape(volume.shape).contiguous(), states, done
+
+
+def steps_back(
+    layout: Layout, states: torch.Tensor, steps: int, done: int, keep: int, forward: Forward
+) -> Iterator[tuple[int, torch.Tensor | None]]:
+    """The steps taken, last first, each with the volume before it (None where none were kept), recomputed between kept ones."""
+    if not keep:
+        yield from ((step, None) for step in reversed(range(done)))
+        return
+    between = [layout.empty(layout.fields, states) for _ in range(min(keep, steps) - 1)]
+    unused = layout.empty(layout.fields, states) if between else states
+    for begin in reversed(range(0, done, keep)):
+        count = min(keep, done - begin)
+        volumes = [states[begin // keep], *between]
+        for i in range(count - 1):
+            forward(volumes[i], volumes[i + 1], unused, begin + i)
+        for i in reversed(range(count)):
+            yield begin + i, volumes[i]
