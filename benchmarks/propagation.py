@@ -1,11 +1,13 @@
 """Speed of propagation as ratios measured in one run: a step against conv3d, the adjoint against the forward.
 
-    python benchmarks/propagation.py [--cells 32 64] [--steps 32] [--repeats 5] [--device cpu|cuda] [--own-only] [--json OUT]
+    python benchmarks/propagation.py [--cells 32 64] [--stencils NAME ...] [--steps 32] [--repeats 5] [--device cpu|cuda]
+        [--own-only] [--json OUT]
 
 Peers: torch's conv3d with the equivalent linear weights (channels_last_3d; autograd through it in both layouts) and the best
 vectorised torch formulation of clamp and occlusion that we know (a product to all face fluxes, clamp, occlusion, shifted
-sums per lobe axis, a product back). Configurations take turns, so that the machine's drift hits
-all alike; medians are printed. The slow peers run fewer times.
+sums per lobe axis, a product back). A learned stencil is measured with occlusion between pairs of cells, against conv3d
+without. Configurations take turns, so that the machine's drift hits all alike; medians are printed. The slow peers run fewer
+times.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ from collections.abc import Callable
 import torch
 
 from difflpv.propagation import propagate
-from difflpv.stencil import FaceStencil, holpv_stencil, lpv_stencil
+from difflpv.stencil import FaceStencil, LinearStencil, holpv_stencil, lpv_stencil
+from difflpv.stencil_files import learned_stencil
 
 
 def interleaved(calls: dict[str, Callable[[], object]], repeats: int, device: torch.device) -> dict[str, float]:
@@ -70,6 +73,60 @@ def torch_convolution(volume: torch.Tensor, weight: torch.Tensor, factors: torch
     return total
 
 
+def convolution_weight(stencil: LinearStencil) -> torch.Tensor:
+    """conv3d's weight [K,K,3,3,3] of a linear stencil."""
+    coeffs = (stencil.l_max + 1) ** 2
+    weight = torch.zeros(coeffs, coeffs, 3, 3, 3)
+    for n, matrix in zip(stencil.offsets.tolist(), stencil.matrices, strict=True):
+        weight[:, :, 1 - n[2], 1 - n[1], 1 - n[0]] = torch.tensor(matrix, dtype=torch.float32)
+    return weight
+
+
+def measure_pairs(stencil: LinearStencil, cells: int, steps: int, repeats: int, device: torch.device) -> dict[str, float]:
+    """A linear stencil with occlusion: its step against conv3d without, its gradients against its forward."""
+    generator = torch.Generator().manual_seed(0)
+    volume = torch.randn(3, (stencil.l_max + 1) ** 2, cells, cells, cells, generator=generator)
+    cotangent = torch.randn(volume.shape, generator=generator).to(device)
+    weight = convolution_weight(stencil).to(device, memory_format=torch.channels_last_3d)
+    inputs = {
+        "volume": volume.to(device),
+        "matrices": torch.tensor(stencil.matrices, dtype=torch.float32, device=device),
+        "factor": torch.full((steps,), 0.97, device=device),
+        "transmittance": torch.rand(stencil.pair_count, cells, cells, cells, generator=generator).to(device),
+    }
+
+    def conv_forward() -> object:
+        with torch.no_grad():
+            return torch_convolution(inputs["volume"], weight, inputs["factor"])
+
+    def forward() -> object:
+        with torch.no_grad():
+            return propagate(stencil=stencil, steps=steps, **inputs)  # type: ignore[arg-type]
+
+    def both(*learned: str) -> Callable[[], object]:
+        def call() -> object:
+            leaves = {name: t.clone().requires_grad_(name in learned) for name, t in inputs.items()}
+            result = propagate(stencil=stencil, steps=steps, **leaves)  # type: ignore[arg-type]
+            return torch.autograd.grad(result, [leaves[name] for name in learned], cotangent)
+
+        return call
+
+    kinds = {
+        "light": ("volume",),
+        "light, transmittance": ("volume", "transmittance"),
+        "light, matrices, factors": ("volume", "matrices", "factor"),
+        "all": tuple(inputs),
+    }
+    calls: dict[str, Callable[[], object]] = {"conv3d forward": conv_forward, "occlusion forward": forward}
+    calls |= {f"occlusion both, {kind}": both(*learned) for kind, learned in kinds.items()}
+    t = interleaved(calls, repeats, device)
+    table = {f"{name} [ms]": 1e3 * seconds for name, seconds in t.items()}
+    table["step with occlusion / conv3d"] = t["occlusion forward"] / t["conv3d forward"]
+    for kind in kinds:
+        table[f"forward+backward / forward, {kind}"] = t[f"occlusion both, {kind}"] / t["occlusion forward"]
+    return table
+
+
 def measure(
     stencil: FaceStencil, cells: int, steps: int, repeats: int, device: torch.device, own_only: bool
 ) -> dict[str, float]:
@@ -79,10 +136,7 @@ def measure(
     volume = torch.randn(3, coeffs, cells, cells, cells, generator=generator)
     volume[:, 0] = volume[:, 0].abs() * 3
     passed = torch.rand(len(stencil.offsets), cells, cells, cells, generator=generator)
-    linear = stencil.linear_part
-    weight = torch.zeros(coeffs, coeffs, 3, 3, 3)
-    for n, matrix in zip(linear.offsets.tolist(), linear.matrices, strict=True):
-        weight[:, :, 1 - n[2], 1 - n[1], 1 - n[0]] = torch.tensor(matrix, dtype=torch.float32)
+    weight = convolution_weight(stencil.linear_part)
     volume, passed, weight = volume.to(device), passed.to(device), weight.to(device)
     fast_weight = weight.contiguous(memory_format=torch.channels_last_3d)
     factors = torch.full((steps,), 0.97, device=device)
@@ -152,6 +206,7 @@ def measure(
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cells", type=int, nargs="+", default=[32, 64])
+    parser.add_argument("--stencils", nargs="+", help="only these of lpv, holpv, learned_9x26")
     parser.add_argument("--steps", type=int, default=32)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--device", default="cpu")
@@ -159,10 +214,15 @@ def main() -> None:
     parser.add_argument("--json")
     arguments = parser.parse_args()
     results = {}
+    device = torch.device(arguments.device)
     for cells in arguments.cells:
-        for stencil in (lpv_stencil(), holpv_stencil()):
-            device = torch.device(arguments.device)
-            row = measure(stencil, cells, arguments.steps, arguments.repeats, device, arguments.own_only)
+        for stencil in (lpv_stencil(), holpv_stencil(), learned_stencil("learned_9x26")):
+            if arguments.stencils and stencil.name not in arguments.stencils:
+                continue
+            if isinstance(stencil, LinearStencil):
+                row = measure_pairs(stencil, cells, arguments.steps, arguments.repeats, device)
+            else:
+                row = measure(stencil, cells, arguments.steps, arguments.repeats, device, arguments.own_only)
             results[f"{stencil.name} {cells}"] = row
             print(f"{stencil.name} {cells}^3, {arguments.steps} steps, {torch.get_num_threads()} threads")
             for name, value in row.items():

@@ -68,7 +68,7 @@ class _Steps:
 
     def _spec(self, step: int) -> dict[str, Any]:
         return {
-            "coeffs": self.layout.coeffs, "axes": self.axes, "channels": self.layout.group,
+            "coeffs": self.layout.coeffs, "axes": self.axes, "channels": _group(self.layout),
             "lanes": self.layout.lanes, "clamp": self.clamp, "occluded": self.occlude(step),
         }  # fmt: skip
 
@@ -78,7 +78,7 @@ class _Steps:
         arguments = [
             as_warp(moving), as_warp(into), as_warp(total), as_warp(self._arriving), v["weights"], v["lobes"], v["factor"],
             v["line_shift"], v["x_shift"], v["first"], v["face"], v["axis"], self.neighbours, self.faces, step, layout.y + 2,
-            layout.pitch, layout.groups, layout.z, layout.y, layout.x,
+            layout.pitch, layout.channels // _group(layout), layout.z, layout.y, layout.x,
         ]  # fmt: skip
         self._launch(forward_kernel(self._scalar, **self._spec(step)), arguments)
 
@@ -97,7 +97,7 @@ class _Steps:
             as_warp(moving), as_warp(lobe_bar), as_warp(into), as_warp(total_bar), as_warp(volume_bar), as_warp(self._leaving),
             as_warp(transmittance_bar), as_warp(factor_bar), v["weights"], v["lobes"], v["factor"], v["line_shift"],
             v["x_shift"], v["face_neighbour"], v["axis"], 0 if start else self.faces // 2, self.faces, int(step == 0), step,
-            layout.y + 2, layout.pitch, layout.groups, layout.z, layout.y, layout.x,
+            layout.y + 2, layout.pitch, layout.channels // _group(layout), layout.z, layout.y, layout.x,
         ]  # fmt: skip
         self._launch(adjoint_kernel(self._scalar, **self._spec(step), **flags), arguments)
 
@@ -106,8 +106,13 @@ class _Steps:
         self._launcher.launch(kernel, _rows(layout), layout.x if self.device.type == "cuda" else 1, arguments)
 
 
+def _group(layout: Layout) -> int:
+    """Channels that one thread works on together."""
+    return 3 if layout.channels % 3 == 0 else 1
+
+
 def _rows(layout: Layout) -> int:
-    return layout.groups * layout.z * layout.y
+    return layout.channels // _group(layout) * layout.z * layout.y
 
 
 @torch.library.custom_op("difflpv::propagate_faces", mutates_args=())

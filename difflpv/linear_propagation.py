@@ -79,7 +79,7 @@ class _Steps:
     def _spec(self, step: int) -> dict[str, Any]:
         layout = self.layout
         return {
-            "coeffs": layout.coeffs, "channels": layout.group, "lanes": layout.lanes, "occluded": self.occlude(step),
+            "coeffs": layout.coeffs, "lanes": layout.lanes, "occluded": self.occlude(step),
         }  # fmt: skip
 
     def forward(self, moving: torch.Tensor, into: torch.Tensor, total: torch.Tensor, step: int) -> None:
@@ -108,7 +108,7 @@ class _Steps:
         arguments = [
             as_warp(moving), as_warp(into), as_warp(total), v["transmittance"], before, transmittance_bar, factor_bar,
             v[weights], v["factor"], v["line_shift"], v["x_shift"], len(self.pairs), step, layout.y + 2, layout.pitch,
-            layout.groups, layout.z, layout.y, layout.x,
+            layout.channels, layout.z, layout.y, layout.x,
         ]  # fmt: skip
         self._launcher.launch(kernel, layout.z * layout.y, self._width, arguments)
 
@@ -118,7 +118,7 @@ class _Steps:
         slabs, rows = self.slabs
         arguments = [
             as_warp(after), as_warp(before), v["transmittance"], as_warp(partial.view(-1)), v["factor"], v["line_shift"],
-            v["x_shift"], len(self.pairs), step, layout.y + 2, layout.pitch, layout.groups, rows, layout.y, layout.x,
+            v["x_shift"], len(self.pairs), step, layout.y + 2, layout.pitch, layout.channels, rows, layout.y, layout.x,
         ]  # fmt: skip
         self._launcher.launch(matrices_kernel(self._scalar, **self._spec(step)), slabs, partial.shape[1], arguments)
 
@@ -215,9 +215,7 @@ def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[torch.Tensor, ...]) 
 
 def _backward(ctx: Any, total_bar: torch.Tensor, *unused: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
     needs = ctx.needs_input_grad[:4]
-    bars = _propagate_backward(
-        total_bar.contiguous(), *ctx.saved_tensors, ctx.occlude_first_step, ctx.keep, *needs[1:]
-    )
+    bars = _propagate_backward(total_bar.contiguous(), *ctx.saved_tensors, ctx.occlude_first_step, ctx.keep, *needs[1:])
     return (*(bar if need else None for bar, need in zip(bars, needs, strict=True)), *[None] * 4)
 
 

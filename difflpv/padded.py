@@ -2,7 +2,8 @@
 
 A buffer is flat: rows of cells along x, all fields of a row together, ``[n_z+2, n_y+2, fields, pitch]`` with ``pitch`` =
 ceil(n_x / lanes) lanes + 2 and ``lanes`` spare elements at the end. The halo of one cell is zero, so that kernels need no
-bounds checks and may read ``lanes`` cells at once.
+bounds checks and may read ``lanes`` cells at once. (Rows that start on vector boundaries were slower: their margins cost more
+memory than aligned access saves.)
 
 Adjoint of A = sum_i S_i with S_{i+1} = F_i(S_i): G_N = Abar, G_i = Abar + (dF_i/dS)^T G_{i+1}, and the volume's gradient
 is G_0. Volumes are kept only where that derivative or a learnable of the propagation needs them.
@@ -56,16 +57,6 @@ class Layout:
         """Elements from one field of a row to the next."""
         return -(-self.x // self.lanes) * self.lanes + 2
 
-    @property
-    def group(self) -> int:
-        """Channels that one thread works on together."""
-        return 3 if self.channels % 3 == 0 else 1
-
-    @property
-    def groups(self) -> int:
-        """Groups of channels."""
-        return self.channels // self.group
-
     def length(self, fields: int) -> int:
         """Elements of a flat buffer of so many fields."""
         return (self.z + 2) * (self.y + 2) * fields * self.pitch + self.lanes
@@ -118,8 +109,7 @@ class SlabLauncher:
         bounds = [items * i // threads for i in range(threads + 1)]
         if (kernel, threads) not in self._commands:
             self._commands[kernel, threads] = [
-                record(kernel, (bounds[i + 1] - bounds[i], width), [*arguments, bounds[i]], self.device)
-                for i in range(threads)
+                record(kernel, (bounds[i + 1] - bounds[i], width), [*arguments, bounds[i]], self.device) for i in range(threads)
             ]
         commands = self._commands[kernel, threads]
         for command in commands:

@@ -13,7 +13,7 @@ from warp_kernels.rsm import rsm_kernels
 from warp_kernels.sampling import sampling_kernels
 
 FACES = {"coeffs": 9, "axes": 6, "channels": 3, "lanes": 1, "clamp": True, "occluded": True}
-PAIRS = {"coeffs": 9, "channels": 3, "lanes": 1, "occluded": True}
+PAIRS = {"coeffs": 9, "lanes": 1, "occluded": True}
 KERNELS = {
     "linear propagation": lambda s: step_kernel(s, **PAIRS, paired=True),
     "linear propagation adjoint": lambda s: step_kernel(

@@ -24,8 +24,9 @@ are no bounds checks. Fields are (c, k) for volumes and n for T. Weights are [1 
 pair, destination from source coefficients.
 
 Threads: one per (z, y) row on the CPU, ``lanes`` neighbouring cells at once, one per cell on CUDA; all channels in one
-thread, for they share T. ``matrices_kernel``: one per (slab of rows, matrix), partial sums per slab, so that their order does
-not depend on the number of threads. Snippets are native for the reasons given in ``warp_kernels.propagation``.
+thread, for they share the gradient of T, but one after the other, so that the fields of a pair stay in registers.
+``matrices_kernel``: one per (slab of rows, matrix), partial sums per slab, so that their order does not depend on the number
+of threads. Snippets are native for the reasons given in ``warp_kernels.propagation``.
 """
 
 import re
@@ -40,11 +41,12 @@ _TYPES = """
 #if defined(__CUDA_ARCH__)
     typedef SCALAR V;
 #else
+    #pragma clang fp contract(fast)
     typedef SCALAR V __attribute__((vector_size(LANES * sizeof(SCALAR)), aligned(sizeof(SCALAR))));
 #endif
     const V zero = {};
     const SCALAR p = factor.data[step];
-    const long long volume_line = (long long)groups * CHANNELS * COEFFS * pitch;
+    const long long volume_line = (long long)channels * COEFFS * pitch;
     const long long passed_line = (long long)pairs * pitch;
 """
 
@@ -54,21 +56,19 @@ _STEP = (
     const SCALAR* w = weights.data;
     const long long line = (long long)(z + 1) * pitch_y + (y + 1);
     V factor_sum = zero;
-    for (int group = 0; group < groups; ++group)
+    for (int c = 0; c < channels; ++c)
     for (int x = x_begin; x < x_end; x += LANES) {
-        const long long at = line * volume_line + group * CHANNELS * COEFFS * pitch + x + 1;
-        V flux[CHANNELS * COEFFS], u[CHANNELS * COEFFS], v[CHANNELS * COEFFS];
+        const long long at = line * volume_line + c * COEFFS * pitch + x + 1;
+        V flux[COEFFS], u[COEFFS], v[COEFFS];
         #pragma unroll
-        for (int i = 0; i < CHANNELS * COEFFS; ++i) {
-            flux[i] = zero;
-            u[i] = *(const V*)(moving.data + at + i * pitch);
+        for (int k = 0; k < COEFFS; ++k) {
+            flux[k] = zero;
+            u[k] = *(const V*)(moving.data + at + k * pitch);
         }
         #pragma unroll
         for (int k = 0; k < COEFFS; ++k)
             #pragma unroll
-            for (int j = 0; j < COEFFS; ++j)
-                #pragma unroll
-                for (int c = 0; c < CHANNELS; ++c) flux[c * COEFFS + k] += u[c * COEFFS + j] * w[k * COEFFS + j];
+            for (int j = 0; j < COEFFS; ++j) flux[k] += u[j] * w[k * COEFFS + j];
         for (int n = 0; n < pairs; ++n) {
             const long long shift = line_shift.data[n] * volume_line + x_shift.data[n];
             const SCALAR* a = w + (2 * n + 1) * COEFFS * COEFFS;
@@ -80,36 +80,34 @@ _STEP = (
                 t1 = *(const V*)passed;
             }
             #pragma unroll
-            for (int i = 0; i < CHANNELS * COEFFS; ++i) {
-                u[i] = *(const V*)(moving.data + at - shift + i * pitch);
-                v[i] = *(const V*)(moving.data + at + shift + i * pitch);
+            for (int k = 0; k < COEFFS; ++k) {
+                u[k] = *(const V*)(moving.data + at - shift + k * pitch);
+                v[k] = *(const V*)(moving.data + at + shift + k * pitch);
                 if (OCCLUDED && !NEED_TRANSMITTANCE) {
-                    u[i] *= t0;
-                    v[i] *= t1;
+                    u[k] *= t0;
+                    v[k] *= t1;
                 }
                 if (PAIRED && !NEED_TRANSMITTANCE) {
-                    const V sum = u[i] + v[i];
-                    v[i] = u[i] - v[i];
-                    u[i] = sum;
+                    const V sum = u[k] + v[k];
+                    v[k] = u[k] - v[k];
+                    u[k] = sum;
                 }
             }
             if (NEED_TRANSMITTANCE) {
                 V bar0 = zero, bar1 = zero;
                 #pragma unroll
-                for (int c = 0; c < CHANNELS; ++c)
+                for (int k = 0; k < COEFFS; ++k) {
+                    V q0 = u[0] * a[k * COEFFS], q1 = v[0] * b[k * COEFFS];
                     #pragma unroll
-                    for (int k = 0; k < COEFFS; ++k) {
-                        V q0 = u[c * COEFFS] * a[k * COEFFS], q1 = v[c * COEFFS] * b[k * COEFFS];
-                        #pragma unroll
-                        for (int j = 1; j < COEFFS; ++j) {
-                            q0 += u[c * COEFFS + j] * a[k * COEFFS + j];
-                            q1 += v[c * COEFFS + j] * b[k * COEFFS + j];
-                        }
-                        const V s = *(const V*)(before.data + at + (c * COEFFS + k) * pitch);
-                        flux[c * COEFFS + k] += q0 * t0 + q1 * t1;
-                        bar0 += q0 * s;
-                        bar1 += q1 * s;
+                    for (int j = 1; j < COEFFS; ++j) {
+                        q0 += u[j] * a[k * COEFFS + j];
+                        q1 += v[j] * b[k * COEFFS + j];
                     }
+                    const V s = *(const V*)(before.data + at + k * pitch);
+                    flux[k] += q0 * t0 + q1 * t1;
+                    bar0 += q0 * s;
+                    bar1 += q1 * s;
+                }
                 SCALAR* near = transmittance_bar.data + 2 * line * passed_line + n * pitch + x + 1;
                 SCALAR* far = near + passed_line;
                 *(V*)near = *(const V*)near + bar1 * p;
@@ -118,20 +116,17 @@ _STEP = (
                 #pragma unroll
                 for (int k = 0; k < COEFFS; ++k)
                     #pragma unroll
-                    for (int j = 0; j < COEFFS; ++j)
-                        #pragma unroll
-                        for (int c = 0; c < CHANNELS; ++c) {
-                            const int i = c * COEFFS + j;
-                            if (PAIRED) flux[c * COEFFS + k] += (ODD(k) == ODD(j) ? u[i] : v[i]) * a[k * COEFFS + j];
-                            else flux[c * COEFFS + k] += u[i] * a[k * COEFFS + j] + v[i] * b[k * COEFFS + j];
-                        }
+                    for (int j = 0; j < COEFFS; ++j) {
+                        if (PAIRED) flux[k] += (ODD(k) == ODD(j) ? u[j] : v[j]) * a[k * COEFFS + j];
+                        else flux[k] += u[j] * a[k * COEFFS + j] + v[j] * b[k * COEFFS + j];
+                    }
         }
         #pragma unroll
-        for (int i = 0; i < CHANNELS * COEFFS; ++i) {
-            SCALAR* out = next.data + at + i * pitch;
-            SCALAR* sum = accumulated.data + at + i * pitch;
-            if (NEED_FACTOR) factor_sum += flux[i] * *(const V*)(before.data + at + i * pitch);
-            const V value = ADJOINT ? *(const V*)sum + flux[i] * p : flux[i] * p;
+        for (int k = 0; k < COEFFS; ++k) {
+            SCALAR* out = next.data + at + k * pitch;
+            SCALAR* sum = accumulated.data + at + k * pitch;
+            if (NEED_FACTOR) factor_sum += flux[k] * *(const V*)(before.data + at + k * pitch);
+            const V value = ADJOINT ? *(const V*)sum + flux[k] * p : flux[k] * p;
             *(V*)out = value;
             if (!ADJOINT) *(V*)sum = *(const V*)sum + value;
             for (int lane = x_size - x; lane < LANES; ++lane) {  // keep the halo zero
@@ -174,7 +169,7 @@ _MATRICES = (
             for (int x = 0; x < x_size; x += LANES) {
                 V t = zero;
                 if (OCCLUDED && side) t = *(const V*)(passed + x);
-                for (int c = 0; c < groups * CHANNELS; ++c) {
+                for (int c = 0; c < channels; ++c) {
                     const long long at = (long long)c * COEFFS * pitch + x;
                     V arriving[COLUMNS];
                     #pragma unroll
@@ -211,7 +206,7 @@ _BLOCKS = {1: (1, 1), 4: (4, 4), 9: (9, 3), 16: (4, 4)}  # sums that stay in reg
 
 
 def cpu_lanes(scalar_bytes: int) -> int:
-    """Cells that one CPU thread works on at once: 64 bytes; half of that took 1.1 to 1.5 times as long."""
+    """Cells that one CPU thread works on at once: 64 bytes; half of that took 1.1 to 1.9 times as long."""
     return 64 // scalar_bytes
 
 
@@ -225,13 +220,13 @@ def _snippet(text: str, scalar: Any, **constants: int) -> str:
 
 @lru_cache
 def step_kernel(
-    scalar: Any, *, coeffs: int, channels: int, lanes: int, paired: bool, occluded: bool, adjoint: bool = False,
+    scalar: Any, *, coeffs: int, lanes: int, paired: bool, occluded: bool, adjoint: bool = False,
     need_factor: bool = False, need_transmittance: bool = False,
 ) -> Any:  # fmt: skip
-    """One step forward, or of the adjoint: scalar type, K, channels at once, lanes (1: a thread per cell, CUDA), flags."""
+    """One step forward, or of the adjoint: scalar type, K, lanes (1: a thread per cell, CUDA), flags."""
     floats, ints = wp.array(dtype=scalar), wp.array(dtype=wp.int32)
     text = _snippet(
-        _STEP, scalar, coeffs=coeffs, channels=channels, lanes=lanes, paired=paired, occluded=occluded, adjoint=adjoint,
+        _STEP, scalar, coeffs=coeffs, lanes=lanes, paired=paired, occluded=occluded, adjoint=adjoint,
         need_factor=need_factor, need_transmittance=need_transmittance,
     )  # fmt: skip
 
@@ -239,21 +234,22 @@ def step_kernel(
     def step_row(
         moving: floats, next: floats, accumulated: floats, transmittance: floats, before: floats, transmittance_bar: floats,
         factor_bar: floats, weights: floats, factor: floats, line_shift: ints, x_shift: ints, pairs: int, step: int,
-        pitch_y: int, pitch: int, groups: int, z_size: int, y_size: int, x_size: int, x_begin: int, x_end: int, z: int, y: int,
+        pitch_y: int, pitch: int, channels: int, z_size: int, y_size: int, x_size: int, x_begin: int, x_end: int, z: int,
+        y: int,
     ): ...  # fmt: skip
 
     @wp.kernel(enable_backward=False, module="unique")
     def propagate_linear(
         moving: floats, next: floats, accumulated: floats, transmittance: floats, before: floats, transmittance_bar: floats,
         factor_bar: floats, weights: floats, factor: floats, line_shift: ints, x_shift: ints, pairs: int, step: int,
-        pitch_y: int, pitch: int, groups: int, z_size: int, y_size: int, x_size: int, row: int,
+        pitch_y: int, pitch: int, channels: int, z_size: int, y_size: int, x_size: int, row: int,
     ):  # fmt: skip
         line, x = wp.tid()
         line = line + row
         x_begin, x_end = wp.where(wp.static(lanes == 1), x, 0), wp.where(wp.static(lanes == 1), x + 1, x_size)
         step_row(
             moving, next, accumulated, transmittance, before, transmittance_bar, factor_bar, weights, factor, line_shift,
-            x_shift, pairs, step, pitch_y, pitch, groups, z_size, y_size, x_size, x_begin, x_end, line // y_size,
+            x_shift, pairs, step, pitch_y, pitch, channels, z_size, y_size, x_size, x_begin, x_end, line // y_size,
             line % y_size,
         )  # fmt: skip
 
@@ -261,30 +257,30 @@ def step_kernel(
 
 
 @lru_cache
-def matrices_kernel(scalar: Any, *, coeffs: int, channels: int, lanes: int, occluded: bool) -> Any:
+def matrices_kernel(scalar: Any, *, coeffs: int, lanes: int, occluded: bool) -> Any:
     """Adds one step's gradient of all matrices onto ``partial`` [slabs, 1 + 2P, K, K]."""
     floats, ints = wp.array(dtype=scalar), wp.array(dtype=wp.int32)
     rows, columns = _BLOCKS[coeffs]
     text = _snippet(
-        _MATRICES, scalar, coeffs=coeffs, channels=channels, lanes=lanes, occluded=occluded, rows=rows, columns=columns
+        _MATRICES, scalar, coeffs=coeffs, lanes=lanes, occluded=occluded, rows=rows, columns=columns
     )
 
     @wp.func_native(text)
     def matrices_slab(
         after: floats, before: floats, transmittance: floats, partial: floats, factor: floats, line_shift: ints,
-        x_shift: ints, pairs: int, step: int, pitch_y: int, pitch: int, groups: int, slab_rows: int, y_size: int, x_size: int,
+        x_shift: ints, pairs: int, step: int, pitch_y: int, pitch: int, channels: int, slab_rows: int, y_size: int, x_size: int,
         slab: int, matrix: int,
     ): ...  # fmt: skip
 
     @wp.kernel(enable_backward=False, module="unique")
     def propagate_linear_matrices(
         after: floats, before: floats, transmittance: floats, partial: floats, factor: floats, line_shift: ints,
-        x_shift: ints, pairs: int, step: int, pitch_y: int, pitch: int, groups: int, slab_rows: int, y_size: int, x_size: int,
+        x_shift: ints, pairs: int, step: int, pitch_y: int, pitch: int, channels: int, slab_rows: int, y_size: int, x_size: int,
         first: int,
     ):  # fmt: skip
         slab, matrix = wp.tid()
         matrices_slab(
-            after, before, transmittance, partial, factor, line_shift, x_shift, pairs, step, pitch_y, pitch, groups,
+            after, before, transmittance, partial, factor, line_shift, x_shift, pairs, step, pitch_y, pitch, channels,
             slab_rows, y_size, x_size, slab + first, matrix,
         )  # fmt: skip
 
