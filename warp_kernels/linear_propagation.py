@@ -154,14 +154,19 @@ _MATRICES = (
     const int n = (matrix - 1) / 2, side = matrix == 0 ? 0 : (matrix % 2 ? -1 : 1);  // S comes from d + side n
     const int lines = matrix ? line_shift.data[n] : 0, columns = matrix ? x_shift.data[n] : 0;
     const long long shift = side * (lines * volume_line + columns);
-    SCALAR* out = partial.data + ((long long)slab * (2 * pairs + 1) + matrix) * COEFFS * COEFFS;
+    const int rows = slab_rows, strip = x_size < 64 ? 64 / x_size : 1;  // rows that stay in cache while all blocks meet them
+    V sums[COEFFS * COEFFS];  // block after block
+    for (int i = 0; i < COEFFS * COEFFS; ++i) sums[i] = zero;
+    for (int begin = 0; begin < rows; begin += strip)
     for (int k = 0; k < COEFFS; k += ROWS)
     for (int j = 0; j < COEFFS; j += COLUMNS) {
+        V* block = sums + k * COEFFS + j * ROWS;
         V sum[ROWS * COLUMNS];
         #pragma unroll
-        for (int i = 0; i < ROWS * COLUMNS; ++i) sum[i] = zero;
-        for (int row = slab * slab_rows; row < (slab + 1) * slab_rows; ++row) {
-            const long long line = (long long)(row / y_size + 1) * pitch_y + (row % y_size + 1);
+        for (int i = 0; i < ROWS * COLUMNS; ++i) sum[i] = block[i];
+        for (int row = begin; row < begin + strip && row < rows; ++row) {
+            const int cell = slab * rows + row;
+            const long long line = (long long)(cell / y_size + 1) * pitch_y + (cell % y_size + 1);
             const SCALAR* g = after.data + line * volume_line + k * pitch + 1;
             const SCALAR* s = before.data + line * volume_line + shift + j * pitch + 1;
             const SCALAR* passed = transmittance.data + line * passed_line + n * pitch + 1;
@@ -187,22 +192,27 @@ _MATRICES = (
             }
         }
         #pragma unroll
+        for (int i = 0; i < ROWS * COLUMNS; ++i) block[i] = sum[i];
+    }
+    SCALAR* out = partial.data + ((long long)slab * (2 * pairs + 1) + matrix) * COEFFS * COEFFS;
+    const V* sum = sums;
+    for (int k = 0; k < COEFFS; k += ROWS)
+    for (int j = 0; j < COEFFS; j += COLUMNS)
         for (int r = 0; r < ROWS; ++r)
-            #pragma unroll
-            for (int i = 0; i < COLUMNS; ++i) {
-                SCALAR total = 0;  // lanes beyond the row hold a zero adjoint
+            for (int i = 0; i < COLUMNS; ++i, ++sum) {
 #if defined(__CUDA_ARCH__)
-                total = sum[r * COLUMNS + i];
+                SCALAR total = *sum;
 #else
-                for (int lane = 0; lane < LANES; ++lane) total += sum[r * COLUMNS + i][lane];
+                SCALAR total = 0;  // lanes beyond the row hold a zero adjoint
+                for (int lane = 0; lane < LANES; ++lane) total += (*sum)[lane];
 #endif
                 out[(k + r) * COEFFS + j + i] += total * p;
             }
-    }
 """
 )
 
-_BLOCKS = {1: (1, 1), 4: (4, 4), 9: (9, 3), 16: (4, 4)}  # sums that stay in registers: 27 of AVX-512's 32
+# Rows and columns of a matrix whose sums stay in registers (27 of AVX-512's 32), measured: (8, 2) and (16, 1) were slower.
+_BLOCKS = {1: (1, 1), 4: (4, 4), 9: (9, 3), 16: (4, 4)}
 
 
 def cpu_lanes(scalar_bytes: int) -> int:
