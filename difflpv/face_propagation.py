@@ -102,8 +102,11 @@ class _Steps:
         self._launch(adjoint_kernel(self._scalar, **self._spec(step), **flags), arguments)
 
     def _launch(self, kernel: Any, arguments: list[Any]) -> None:
+        """One group of channels after the other: they add onto the same transmittance gradient."""
         layout = self.layout
-        self._launcher.launch(kernel, _rows(layout), layout.x if self.device.type == "cuda" else 1, arguments)
+        rows, width = layout.z * layout.y, layout.x if self.device.type == "cuda" else 1
+        for group in range(layout.channels // _group(layout)):
+            self._launcher.launch(kernel, rows, width, arguments, first=group * rows)
 
 
 def _group(layout: Layout) -> int:

@@ -99,19 +99,19 @@ class SlabLauncher:
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
-        self._commands: dict[tuple[Any, int], list[Any]] = {}  # recorded launches: a generic one costs ten times a replay
+        self._commands: dict[tuple[Any, int, int], list[Any]] = {}  # recorded: a generic launch costs ten replays
 
-    def launch(self, kernel: Any, items: int, width: int, arguments: list[Any]) -> None:
-        """Run ``items`` x ``width`` threads; the kernel's last argument is the first item of a slab."""
+    def launch(self, kernel: Any, items: int, width: int, arguments: list[Any], *, first: int = 0) -> None:
+        """Run ``items`` x ``width`` threads, items from ``first``; the kernel's last argument is the first item of a slab."""
         if not items:
             return
         threads = 1 if self.device.type == "cuda" else max(1, min(torch.get_num_threads(), items))
-        bounds = [items * i // threads for i in range(threads + 1)]
-        if (kernel, threads) not in self._commands:
-            self._commands[kernel, threads] = [
+        bounds = [first + items * i // threads for i in range(threads + 1)]
+        if (kernel, threads, first) not in self._commands:
+            self._commands[kernel, threads, first] = [
                 record(kernel, (bounds[i + 1] - bounds[i], width), [*arguments, bounds[i]], self.device) for i in range(threads)
             ]
-        commands = self._commands[kernel, threads]
+        commands = self._commands[kernel, threads, first]
         for command in commands:
             for index, value in enumerate(arguments):
                 command.set_param_at_index_from_ctype(index, value)

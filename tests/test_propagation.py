@@ -216,8 +216,12 @@ def test_no_steps_and_no_channels():
     assert propagate(torch.zeros(0, 4, 2, 2, 2), lpv_stencil(), steps=3).shape == (0, 4, 2, 2, 2)
 
 
-def test_threads_do_not_change_a_bit(generator):
-    volume, passed, factors = random_problem(holpv_stencil(), (5, 6, 7), 3, generator, dtype=torch.float32)
+@pytest.mark.parametrize("channels", [3, 4])
+def test_threads_do_not_change_a_bit(channels, generator):
+    """Four channels are four groups, which share the transmittance's gradient."""
+    volume, passed, factors = random_problem(
+        holpv_stencil(), (5, 6, 7), 3, generator, channels=channels, dtype=torch.float32
+    )
     threads = torch.get_num_threads()
     results = []
     try:
