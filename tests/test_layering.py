@@ -128,6 +128,7 @@ LIBRARY_OWNERS: dict[str, tuple[str, ...]] = {
     "trimesh": ("difflpv.io.obj", "difflpv.io.ply", "difflpv.io.gltf"),
     "embreex": ("difflpv.raycast",),
     "nlopt": ("difflpv.optim.nlopt_solver",),
+    "cma": ("difflpv.optim.cma_solver",),
     "kornia": ("difflpv.loss",),
     "safetensors": ("difflpv.fitted", "difflpv.stencil_files"),
     "matplotlib": ("difflpv.report", "scripts"),
