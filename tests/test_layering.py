@@ -65,7 +65,7 @@ LAYERS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ),
     ("optim", ("difflpv.optim",)),
     ("data_gen", ("data_gen",)),
-    ("jobs", ("difflpv.evaluate", "difflpv.fit", "difflpv.simulate", "difflpv.training")),
+    ("jobs", ("difflpv.evaluate", "difflpv.fit", "difflpv.simulate", "difflpv.training", "difflpv.trouble")),
     ("report", ("difflpv.report",)),
     ("demo", ("difflpv.demo",)),
     ("cli", ("difflpv.cli",)),

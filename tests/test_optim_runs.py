@@ -70,7 +70,7 @@ def test_time_limit(solver):
         return (p["x"] ** 2).sum()
 
     problem = Problem(slow, [Parameter("x", [0.5, 0.4], -1, 1)])
-    result = solve(problem, solver, budget=1e4, seconds=0.05, tolerance=0, **adam_steps(solver))
+    result = solve(problem, solver, budget=1e4, seconds=0.03, tolerance=0, **adam_steps(solver))
     assert result.status is Status.TIME_LIMIT and 1 <= result.evaluations <= 4
     assert math.isfinite(result.loss)
 
