@@ -20,6 +20,7 @@ __all__ = ["describe_trouble", "free_space"]
 _LOST_SHARE = 1e-6
 _PEAK_GROWTH = 10.0  # a fit may raise some steps' factors; light that grows tenfold on its way is no transport
 _NEGATIVE_SHARE = 0.05  # the lobes' own truncation makes 0.02 to 0.03 (``difflpv.stability.negative_share``)
+_NARROW_CELLS = 1.5  # free space that a receiver needs: errors double between two cells per room and one
 _NARROW_SHARE = 0.25  # of the receivers
 _THIN_SHARE = 0.02  # of the receivers
 _PROBED = 512  # receivers whose surroundings are looked at
@@ -47,7 +48,7 @@ def describe_trouble(
     found = [_outside(lpv, position)]
     if len(light.vpls()):
         found = [_lost(lpv), *found, _growth(lpv, values), _reach(lpv, light), *_cells(lpv, light, position, normal)]
-        found += [_negative(irradiance), _albedo(light)]
+        found += [_negative(irradiance), _albedo(light), _dim(light)]
     return tuple(line for line in found if line)
 
 
@@ -115,11 +116,11 @@ def _cells(lpv: Lpv, light: Illumination, position: np.ndarray, normal: np.ndarr
     some = np.unique(np.linspace(0, len(position) - 1, min(len(position), _PROBED)).round().astype(int))
     front, behind = free_space(light, np.asarray(position)[some], np.asarray(normal)[some])
     size, lines = lpv.grid.cell_size, []
-    narrow, thin = float((front < size).mean()), float((behind < size).mean())
+    narrow, thin = float((front < _NARROW_CELLS * size).mean()), float((behind < size).mean())
     if narrow > _NARROW_SHARE:
         lines.append(
-            f"cells of {size:.4g} m are larger than the rooms: {100 * narrow:.0f} % of the receivers have less than a cell of "
-            f"free space (median {np.median(front):.3g} m) in front of them; take more cells"
+            f"cells of {size:.4g} m are too large for the rooms: {100 * narrow:.0f} % of the receivers have less than "
+            f"{_NARROW_CELLS:g} cells of free space in front of them (median {np.median(front):.3g} m); take more cells"
         )
     if thin > _THIN_SHARE:
         lines.append(
@@ -153,6 +154,26 @@ def _albedo(light: Illumination) -> str:
         f"the mean albedo is {albedo:.3g}: in a closed room the first bounce is about {100 * (1 - albedo):.2g} % of all "
         "reflected light, and component 'bounce1' holds nothing else"
     )
+
+
+def _dim(light: Illumination) -> str:
+    """Below tiny / eps, numbers lose digits on their way, and then everything."""
+    flux = light.vpls().flux
+    limits = torch.finfo(flux.dtype)
+    brightest = float(flux.max())
+    if not 0 <= brightest < limits.tiny / limits.eps or not _shines(light):
+        return ""
+    kind = str(flux.dtype).removeprefix("torch.")
+    return (
+        f"the lights are too dim for {kind}: the brightest VPL has {brightest:.3g} W, below {limits.tiny / limits.eps:.2g} W "
+        "digits are lost; scale the lights and divide the result"
+    )
+
+
+def _shines(light: Illumination) -> bool:
+    """True unless every light of the scene is exactly dark."""
+    names = ("radiance", "intensity", "irradiance")
+    return any(np.any(getattr(item, name, 0.0)) for item in light.scene.lights for name in names)
 
 
 def _corner(values: tuple[float, float, float]) -> str:

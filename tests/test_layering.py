@@ -67,7 +67,7 @@ LAYERS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("data_gen", ("data_gen",)),
     ("jobs", ("difflpv.evaluate", "difflpv.fit", "difflpv.simulate", "difflpv.training", "difflpv.trouble")),
     ("report", ("difflpv.report",)),
-    ("demo", ("difflpv.demo",)),
+    ("demo", ("difflpv.demo", "difflpv.stress")),
     ("cli", ("difflpv.cli",)),
     ("scripts", ("scripts",)),
 )
@@ -119,7 +119,7 @@ ONLY = (
 )
 
 # Only these parts may know the path tracer: what they judge must not.
-DATA_GEN_USERS = ("data_gen", "difflpv.cli", "difflpv.demo", "scripts")
+DATA_GEN_USERS = ("data_gen", "difflpv.cli", "difflpv.demo", "difflpv.stress", "scripts")
 
 LIBRARY_OWNERS: dict[str, tuple[str, ...]] = {
     "warp": ("warp_kernels", "difflpv.bridge", "difflpv.face_propagation"),

@@ -1,5 +1,7 @@
 """Each limit of a solve from both sides: no word just below, one line with its cure just above."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,7 @@ from difflpv.config import LpvConfig
 from difflpv.grid import Grid
 from difflpv.illumination import illuminate
 from difflpv.pipeline import Lpv
-from difflpv.scene import AreaLight, Scene
+from difflpv.scene import AreaLight, Scene, SceneError
 from difflpv.simulate import simulate
 from difflpv.trouble import describe_trouble, free_space
 
@@ -86,13 +88,13 @@ def test_steps_that_cannot_cross_the_room():
 
 
 def test_cells_larger_than_the_room():
-    """A room of 2 m in a grid of three cells: 2 m a cell is still no larger than the room, 2.1 m is."""
+    """A room of 2 m in a grid of three cells: its receivers need one and a half cells in front of them."""
     scene, _ = room()
     config, (position, normal) = LpvConfig(steps=3), receivers()
-    for size, expected in ((1.99, False), (2.01, True)):
+    for size, expected in ((1.32, False), (1.34, True)):
         grid = Grid((-1.5 * size,) * 3, size, (3, 3, 3))
         lines = simulate(scene, position, normal, grid=grid, config=config).warnings
-        assert any(f"cells of {size:.4g} m are larger than the rooms: 100 % of the receivers" in w for w in lines) is expected
+        assert any(f"cells of {size:.4g} m are too large for the rooms: 100 % of the receivers" in w for w in lines) is expected
 
 
 @pytest.mark.parametrize(("thickness", "thin"), [(0.35, False), (0.32, True)])
@@ -133,6 +135,66 @@ def test_one_bounce_in_a_white_room(albedo, high):
     assert bool(lines) is high
     assert not high or "first bounce is about 9 % of all reflected light" in lines[0]
     assert told(LpvConfig(steps=8), albedo=albedo, component="direct") == ()
+
+
+@pytest.mark.parametrize(("dtype", "limit"), [(torch.float32, 9.9e-32), (torch.float64, 1e-292)])
+def test_lights_too_dim_for_their_precision(dtype, limit):
+    scene, grid = room()
+    position, normal = receivers()
+    for factor, dim in ((2.0, False), (0.5, True)):
+        # The panel's 9 VPLs have pi L A / 9 W, A = 0.16 m2.
+        lights = [AreaLight("lamp", np.full(3, factor * limit * 9 / (np.pi * 0.16)))]
+        light = illuminate(scene.with_lights(lights), grid, LpvConfig(steps=8), "direct", dtype=dtype, **FEW)
+        lpv = Lpv(grid, LpvConfig(steps=8))
+        irradiance = lpv(light, light.receivers(position, normal)).numpy()
+        lines = describe_trouble(lpv, light, position, normal, irradiance)
+        assert any("too dim for float" in line and "scale the lights" in line for line in lines) is dim
+
+
+def test_a_light_that_is_off_is_not_dim():
+    scene, grid = room()
+    light = illuminate(scene.with_lights([AreaLight("lamp", np.zeros(3))]), grid, LpvConfig(steps=8), "direct", **FEW)
+    lpv, (position, normal) = Lpv(grid, LpvConfig(steps=8)), receivers()
+    irradiance = lpv(light, light.receivers(position, normal)).numpy()
+    assert describe_trouble(lpv, light, position, normal, irradiance) == ()
+
+
+def moved(scene, factor=1.0, offset=0.0):
+    meshes = tuple(replace(m, vertices=factor * m.vertices + [offset, 0, 0]) for m in scene.meshes)
+    return replace(scene, meshes=meshes)
+
+
+@pytest.mark.parametrize(("edge", "refused"), [(2e-5, False), (9e-6, True), (9e8, False), (2e9, True)])
+def test_scenes_of_a_size_that_float32_cannot_hold(edge, refused):
+    """At each size that is let through the answer is that of a room of 2 m: irradiance under a panel has no length in it."""
+    scene, grid = room()
+    position, normal = receivers()
+    small = moved(scene, edge / 2)
+    own = Grid(tuple(edge / 2 * v for v in grid.minimum), edge / 2 * grid.cell_size, grid.resolution)
+    config = LpvConfig(steps=8, occlusion="exp")
+    if refused:
+        with pytest.raises(SceneError, match=r"m across, rays and form factors work from 1e-05 to 1e\+09 m: rescale it"):
+            illuminate(small, own, config)
+        return
+    expected = simulate(scene, position, normal, grid=grid, config=config).irradiance
+    found = simulate(small, edge / 2 * position, normal, grid=own, config=config).irradiance
+    np.testing.assert_allclose(found, expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize(("offset", "refused"), [(1900.0, False), (2100.0, True)])
+def test_scenes_far_from_the_origin(offset, refused):
+    scene, grid = room()
+    position, normal = receivers()
+    away = moved(scene, offset=offset)
+    own = Grid((grid.minimum[0] + offset, *grid.minimum[1:]), grid.cell_size, grid.resolution)
+    config = LpvConfig(steps=8)
+    if refused:
+        with pytest.raises(SceneError, match="more than 1000 times its size: float32 rays cannot tell"):
+            illuminate(away, own, config)
+        return
+    expected = simulate(scene, position, normal, grid=grid, config=config).irradiance
+    found = simulate(away, position + [offset, 0, 0], normal, grid=own, config=config).irradiance
+    assert np.linalg.norm(found - expected) < 0.02 * np.linalg.norm(expected)
 
 
 def test_light_that_needs_no_volume_is_not_judged_by_it():
