@@ -22,6 +22,8 @@ _PEAK_GROWTH = 10.0  # a fit may raise some steps' factors; light that grows ten
 _NEGATIVE_SHARE = 0.05  # the lobes' own truncation makes 0.02 to 0.03 (``difflpv.stability.negative_share``)
 _NARROW_CELLS = 1.5  # free space that a receiver needs: errors double between two cells per room and one
 _NARROW_SHARE = 0.25  # of the receivers
+_SPARSE = 8.0  # cell faces per sample: fewer samples than that begin to show
+_TRAINED = 32  # cells: learned stencils were trained to 16, and hold out to twice that
 _THIN_SHARE = 0.02  # of the receivers
 _PROBED = 512  # receivers whose surroundings are looked at
 _HIGH_ALBEDO = 0.9
@@ -47,8 +49,8 @@ def describe_trouble(
     """
     found = [_outside(lpv, position)]
     if len(light.vpls()):
-        found = [_lost(lpv), *found, _growth(lpv, values), _reach(lpv, light), *_cells(lpv, light, position, normal)]
-        found += [_negative(irradiance), _albedo(light), _dim(light)]
+        found = [_lost(lpv), *found, _growth(lpv, values), _reach(lpv, light), _untrained(lpv, light), _sparse(lpv, light)]
+        found += [*_cells(lpv, light, position, normal), _negative(irradiance), _albedo(light), _dim(light)]
     return tuple(line for line in found if line)
 
 
@@ -98,14 +100,48 @@ def _growth(lpv: Lpv, values: Mapping[str, torch.Tensor] | None) -> str:
 
 def _reach(lpv: Lpv, light: Illumination) -> str:
     """Light moves at most one cell per step along each axis."""
-    low, high = light.scene.bounds
-    low, high = np.maximum(low, lpv.grid.minimum), np.minimum(high, lpv.grid.maximum)
-    cells = int(np.ceil(float((high - low).max()) / lpv.grid.cell_size - 1e-6))
+    cells = _span(lpv, light)
     if lpv.config.steps >= cells - 1 or lpv.config.tolerance > 0:
         return ""
     return (
         f"{lpv.config.steps} steps carry light {lpv.config.steps} cells at most, the scene spans {cells}: what lies farther "
         f"from the light stays dark; take at least {cells - 1} steps or larger cells"
+    )
+
+
+def _span(lpv: Lpv, light: Illumination) -> int:
+    """Cells that the scene fills along its longest axis."""
+    low, high = light.scene.bounds
+    low, high = np.maximum(low, lpv.grid.minimum), np.minimum(high, lpv.grid.maximum)
+    return int(np.ceil(float((high - low).max()) / lpv.grid.cell_size - 1e-6))
+
+
+def _untrained(lpv: Lpv, light: Illumination) -> str:
+    cells = _span(lpv, light)
+    if not lpv.config.method.startswith("learned") or cells <= _TRAINED:
+        return ""
+    return (
+        f"the scene spans {cells} cells, '{lpv.config.method}' was trained to {_TRAINED // 2} and holds to about {_TRAINED}: "
+        "far light is wrong; take larger cells"
+    )
+
+
+def _sparse(lpv: Lpv, light: Illumination) -> str:
+    """Samples farther apart than cells leave cells dark that should be lit, and holes in walls."""
+    vpls, scene = light.vpls(), light.scene
+    if light.samples is not None:
+        areas = light.samples.area
+    elif light.component == "direct":
+        shines = scene.mesh_emission.max(1)[scene.triangle_mesh] > 0
+        areas = torch.tensor([float(scene.triangle_areas[shines].sum()) / len(vpls)])
+    else:
+        return ""
+    faces = float(areas.double().mean()) / lpv.grid.cell_size**2 if len(areas) else 0.0
+    if not faces > _SPARSE:
+        return ""
+    return (
+        f"{len(vpls)} VPLs are few for cells of {lpv.grid.cell_size:.3g} m: one per {faces:.3g} cell faces, and the cells "
+        "between stay dark; illuminate with more surface_samples and area_samples, or take larger cells"
     )
 
 
@@ -135,10 +171,10 @@ def _negative(irradiance: np.ndarray) -> str:
     if not below > _NEGATIVE_SHARE * above:
         return ""
     rows = int((irradiance < 0).any(1).sum())
-    share = 100 * below / above if above > 0 else math.inf
+    share = f"{100 * below / above:.3g} % of the positive sum" if above > 0 else "and positive nowhere"
     return (
-        f"irradiance is negative at {rows} of {len(irradiance)} receivers ({share:.3g} % of the positive sum): negative lobes; "
-        "use clamp, another stencil or smaller cells"
+        f"irradiance is negative at {rows} of {len(irradiance)} receivers ({share}): negative lobes; use clamp, another "
+        "stencil, smaller cells or more steps"
     )
 
 

@@ -151,6 +151,26 @@ def test_lights_too_dim_for_their_precision(dtype, limit):
         assert any("too dim for float" in line and "scale the lights" in line for line in lines) is dim
 
 
+@pytest.mark.parametrize(("cells", "far"), [(34, False), (35, True)])
+def test_a_learned_stencil_beyond_its_training(cells, far):
+    """The room fills all cells but two."""
+    for method, expected in (("learned_4x6", far), ("lpv", False)):
+        lines = told(LpvConfig(method=method, steps=40), cells=cells)
+        assert any("'learned_4x6' was trained to 16 and holds to about 32" in line for line in lines) is expected
+
+
+@pytest.mark.parametrize(("samples", "few"), [(40, False), (20, True)])
+def test_vpls_that_are_few_for_their_cells(samples, few):
+    """Six walls of 4 m2 on cells of a third of a metre: 216 cell faces."""
+    scene, grid = room()
+    config, (position, normal) = LpvConfig(steps=8), receivers()
+    light = illuminate(scene, grid, config, surface_samples=samples, area_samples=9)
+    lpv = Lpv(grid, config)
+    irradiance = lpv(light, light.receivers(position, normal)).numpy()
+    lines = describe_trouble(lpv, light, position, normal, irradiance)
+    assert any("VPLs are few for cells of 0.333 m" in line and "more surface_samples" in line for line in lines) is few
+
+
 def test_a_light_that_is_off_is_not_dim():
     scene, grid = room()
     light = illuminate(scene.with_lights([AreaLight("lamp", np.zeros(3))]), grid, LpvConfig(steps=8), "direct", **FEW)

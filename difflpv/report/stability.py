@@ -18,7 +18,7 @@ __all__ = ["draw_experiment"]
 _COLORS = ("#e69f00", "#d55e00", "#56b4e9", "#0057a3", "#00795a", "#cc79a7", "#777777", "#7fc8a9", "#8c6d1f", "#5b3a8c")
 _DASHES = ("-", "--", ":", "-.")
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "<", ">")
-_DPI = 80
+_DPI = 66
 _DECADES = 25.0  # between the smallest and the largest value that an axis shows
 _LOG_FROM = 20.0  # largest over smallest value from which an axis is logarithmic
 
@@ -36,7 +36,7 @@ def draw_experiment(experiment: Mapping[str, Any]) -> bytes:
         if any(r[name] is not None for r in readings)
     ]
     methods = list(dict.fromkeys(r["method"] for r in readings))
-    figure = new_figure(4.1 * len(panels) + 1.9, 3.5, dpi=_DPI)
+    figure = new_figure(3.5 * len(panels) + 2.0, 3.0, dpi=_DPI)
     axes = axes_in_row(figure, len(panels))
     for axis, (name, label) in zip(axes, panels, strict=True):
         _draw_panel(axis, experiment, methods, name)
@@ -49,12 +49,12 @@ def draw_experiment(experiment: Mapping[str, Any]) -> bytes:
 
 
 def _draw_panel(axis: Axes, experiment: Mapping[str, Any], methods: Sequence[str], name: str) -> None:
-    shown = []
+    every = np.array([np.nan if r[name] is None else r[name] for r in experiment["readings"]], float)
+    low, high, log = _range(every)
     for k, method in enumerate(methods):
         own = [r for r in experiment["readings"] if r["method"] == method]
         x = np.array([r["knob"] for r in own], float)
-        y = np.array([np.nan if r[name] is None else r[name] for r in own], float)
-        shown.append(y)
+        y = np.array([np.nan if r[name] is None else max(r[name], low) for r in own], float)  # zeros lie on the edge
         style: dict[str, Any] = {"color": _COLORS[k % len(_COLORS)], "label": method, "markersize": 4}
         if experiment["categories"]:
             axis.plot(x + 0.08 * (k - (len(methods) - 1) / 2), y, _MARKERS[k % len(_MARKERS)], **style)
@@ -66,18 +66,32 @@ def _draw_panel(axis: Axes, experiment: Mapping[str, Any], methods: Sequence[str
         if told.any() and not experiment["categories"]:
             axis.plot(x[told], y[told], "x", color="#333333", markersize=7, markeredgewidth=1.0)
     if experiment["log_knob"]:
-        axis.set_xscale("log")
+        _log_knob(axis, sorted({float(r["knob"]) for r in experiment["readings"]}))
     if experiment["categories"]:
         axis.set_xticks(range(len(experiment["categories"])), experiment["categories"], fontsize=8)
-    _scale(axis, np.concatenate(shown))
+    if log:
+        axis.set_yscale("log")
+    axis.set_ylim(low, high)
 
 
-def _scale(axis: Axes, values: np.ndarray) -> None:
-    """Logarithmic where values span more than ``_LOG_FROM``; zeros lie on its lower edge."""
-    positive = values[np.isfinite(values) & (values > 0)]
-    if not len(positive) or positive.max() < _LOG_FROM * positive.min() or (values[np.isfinite(values)] < 0).any():
-        axis.set_ylim(bottom=min(0.0, float(np.nanmin(values))) if np.isfinite(values).any() else 0.0)
-        return
-    axis.set_yscale("log")
+def _log_knob(axis: Axes, knobs: Sequence[float]) -> None:
+    """A logarithmic axis with plain numbers where the knob spans few decades."""
+    from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+
+    axis.set_xscale("log")
+    axis.xaxis.set_minor_locator(NullLocator())
+    if knobs[-1] < 1e4 * knobs[0]:
+        ticks = [k for i, k in enumerate(knobs) if i == 0 or k > 1.4 * knobs[i - 1]]
+        axis.xaxis.set_major_locator(FixedLocator(ticks if len(ticks) < 8 else ticks[::2]))
+        axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.2g}" if value < 1 else f"{value:.3g}"))
+
+
+def _range(values: np.ndarray) -> tuple[float, float, bool]:
+    """Lowest and highest shown value, and whether the axis is logarithmic: where values span more than ``_LOG_FROM``."""
+    finite = values[np.isfinite(values)]
+    positive = finite[finite > 0]
+    if not len(positive) or positive.max() < _LOG_FROM * positive.min() or (finite < 0).any():
+        high = float(finite.max(initial=0.0))
+        return min(0.0, float(finite.min(initial=0.0))), 1.08 * high if high > 0 else 1.0, False
     low = max(float(positive.min()), float(positive.max()) * 10**-_DECADES)
-    axis.set_ylim(0.7 * low, 1.5 * float(positive.max()))
+    return 0.6 * low, 1.6 * float(positive.max()), True

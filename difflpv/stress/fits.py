@@ -17,10 +17,8 @@ from difflpv.stress.scenes import Case, room_scene
 __all__ = ["fit_rate", "fit_start"]
 
 _TRUE_FACTOR = 0.9
-_STEPS = (16, 400)
 _STARTS = (0.1, 0.5, 0.99, 1.01, 1.05, 1.2, 1.5, 1.9)
 _RATES = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0)
-_BUDGET = 60.0
 _TOLD = ("not finite", "diverged", "no step of", "started from", "loss is", "gradient is")
 
 
@@ -31,7 +29,7 @@ def fit_start(bench: Bench) -> Experiment:
         f"{solver}, {steps} steps": [
             (p, {"solver": solver, "initial": {"propagation": p}, "steps": steps}) for p in _STARTS
         ]
-        for steps in _STEPS
+        for steps in bench.settings.fit_steps
         for solver in solvers
     }
     return _experiment(
@@ -51,7 +49,7 @@ def fit_rate(bench: Bench) -> Experiment:
         f"adam, {steps} steps": [
             (r, {"solver": "adam", "lr": r, "initial": {"propagation": 0.8}, "steps": steps}) for r in _RATES
         ]
-        for steps in _STEPS
+        for steps in bench.settings.fit_steps
     }
     return _experiment(
         bench,
@@ -73,12 +71,13 @@ def _experiment(
     detected: str,
     cure: str,
 ) -> Experiment:
-    targets = {steps: _target(steps, bench.settings.seed) for steps in _STEPS}
+    targets = {steps: _target(steps, bench.settings.seed) for steps in bench.settings.fit_steps}
     readings, limits = [], []
     for method, settings in runs.items():
         own = []
         for value, options in settings:
             steps = options.pop("steps")
+            options["budget"] = bench.settings.fit_budget
             own.append(_fitted(method, value, targets[steps], LpvConfig(method="lpv", steps=steps), options))
         readings += own
         found = [r for r in own if r.error is not None and r.error < 0.05]
@@ -101,9 +100,9 @@ def _experiment(
         title,
         knob,
         "",
-        f"A closed cube, 8³ cells, lpv; the target is the solve itself with the factor {_TRUE_FACTOR}; {_BUDGET:g} "
-        "forward-equivalents. The error is the loss at the point that comes back; beside it the last evaluation's loss over "
-        "the first's, and the factor that comes back over the true one.",
+        f"A closed cube, 8³ cells, lpv; the target is the solve itself with the factor {_TRUE_FACTOR}; "
+        f"{bench.settings.fit_budget:g} forward-equivalents. The error is the loss at the point that comes back; beside it the "
+        "last evaluation's loss over the first's, and the factor that comes back over the true one.",
         tuple(readings),
         tuple(limits),
         f"{len(readings) - len(bad)} of {len(readings)} fits come back with a finite point.",
@@ -136,7 +135,6 @@ def _fitted(method: str, value: float, target: LightTarget, config: LpvConfig, o
         learn=["propagation"],
         train=[0],
         test=[],
-        budget=_BUDGET,
         **options,
     )
     result = outcome.result

@@ -54,9 +54,20 @@ class Lit:
         grid: Grid | None = None,
         seed: int = 0,
         dtype: torch.dtype = torch.float32,
+        surface_samples: int = 8192,
+        area_samples: int = 64,
     ) -> Lit:
         """Trace a case; on its own grid unless another is given."""
-        light = illuminate(case.scene, grid or case.grid, config, component, seed=seed, dtype=dtype)
+        light = illuminate(
+            case.scene,
+            grid or case.grid,
+            config,
+            component,
+            surface_samples=surface_samples,
+            area_samples=area_samples,
+            seed=seed,
+            dtype=dtype,
+        )
         return cls(case, light, component)
 
 
@@ -99,4 +110,4 @@ def read(
     found = irradiance.detach().numpy()
     said = describe_trouble(lpv, lit.light, case.position, case.normal, found, given)
     energy = float(case.weight @ found.sum(1) / (case.weight @ case.truth[lit.component].sum(1)))
-    return Reading(name, knob, float(error.detach()), gradient, energy, "; ".join(said))
+    return Reading(name, knob, float(error.detach()), gradient, energy, "\n".join(said))

@@ -70,8 +70,8 @@ def _messages(experiment: Experiment) -> list[str]:
     """One example of each kind of message, with where it came."""
     found: dict[str, str] = {}
     for reading in experiment.readings:
-        for line in filter(None, reading.message.split("; ")):
-            kind = " ".join(line.split()[:3])
+        for line in reading.message.splitlines():
+            kind = " ".join(w for w in line.split()[:8] if w.isalpha())  # the same words with other numbers are the same
             where = experiment.categories[int(reading.knob)] if experiment.categories else f"{reading.knob:g}"
             found.setdefault(kind, f"{reading.method} at {where}: “{line}”")
     return list(found.values())[:6]

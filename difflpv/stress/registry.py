@@ -12,6 +12,7 @@ from difflpv.stress.measure import Bench
 from difflpv.stress.placement import rotation, translation
 from difflpv.stress.refinement import door, refinement, refinement_direct, rooms, walls
 from difflpv.stress.results import Experiment
+from difflpv.stress.samples import samples
 from difflpv.stress.scale import length, radiance
 
 __all__ = ["EXPERIMENTS"]
@@ -25,6 +26,7 @@ EXPERIMENTS: dict[str, Callable[[Bench], Experiment]] = {
     "albedo": albedo,
     "refinement": refinement,
     "refinement_direct": refinement_direct,
+    "samples": samples,
     "rooms": rooms,
     "walls": walls,
     "door": door,

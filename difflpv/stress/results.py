@@ -20,7 +20,7 @@ class Reading:
         error: the experiment's error, relative L2 of irradiance as a rule.
         gradient: norm of the gradient of the error, with respect to what the experiment names.
         energy: mean irradiance over the true mean.
-        message: what the library said, empty for nothing.
+        message: what the library said, a line each, empty for nothing.
     """
 
     method: str

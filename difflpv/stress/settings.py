@@ -33,6 +33,8 @@ class StressSettings:
         factors: propagation factors over the critical one.
         moves: positions of a light on its way through one cell.
         angles: rotations of the scene in its grid [degrees].
+        fit_steps: few and many propagation steps of the fits of a propagation factor.
+        fit_budget: forward-equivalents of each of them.
         starts: random starts of each inverse problem.
         budget: forward-equivalents of each fit of an inverse problem.
     """
@@ -47,8 +49,10 @@ class StressSettings:
     factors: tuple[float, ...] = (0.25, 0.5, 0.75, 0.9, 0.97, 1.0, 1.01, 1.03, 1.1, 1.25, 1.5, 2.0)
     moves: int = 32
     angles: tuple[float, ...] = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0, 45.0)
+    fit_steps: tuple[int, int] = (16, 300)
+    fit_budget: float = 60.0
     starts: int = 20
-    budget: float = 90.0
+    budget: float = 60.0
 
     @classmethod
     def quick(cls, seed: int = 0) -> StressSettings:
@@ -63,6 +67,7 @@ class StressSettings:
             factors=(0.25, 0.75, 0.9, 1.0, 1.03, 1.25, 2.0),
             moves=16,
             angles=(0.0, 15.0, 30.0, 45.0),
+            fit_budget=30.0,
             starts=4,
             budget=45.0,
         )
