@@ -159,7 +159,7 @@ def test_a_learned_stencil_beyond_its_training(cells, far):
         assert any("'learned_4x6' was trained to 16 and holds to about 32" in line for line in lines) is expected
 
 
-@pytest.mark.parametrize(("samples", "few"), [(40, False), (20, True)])
+@pytest.mark.parametrize(("samples", "few"), [(72, False), (40, True)])
 def test_vpls_that_are_few_for_their_cells(samples, few):
     """Six walls of 4 m2 on cells of a third of a metre: 216 cell faces."""
     scene, grid = room()

@@ -18,7 +18,7 @@ __all__ = ["draw_experiment"]
 _COLORS = ("#e69f00", "#d55e00", "#56b4e9", "#0057a3", "#00795a", "#cc79a7", "#777777", "#7fc8a9", "#8c6d1f", "#5b3a8c")
 _DASHES = ("-", "--", ":", "-.")
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "<", ">")
-_DPI = 66
+_DPI = 62
 _DECADES = 25.0  # between the smallest and the largest value that an axis shows
 _LOG_FROM = 20.0  # largest over smallest value from which an axis is logarithmic
 

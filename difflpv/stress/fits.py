@@ -90,7 +90,7 @@ def _experiment(
                 f"finds the factor from {', '.join(f'{r.knob:g}' for r in found) or 'nowhere'}",
                 "; ".join(f"from {r.knob:g} comes back with {r.energy:.3g} times the true factor" for r in rest if r.energy)
                 or "not reached",
-                f"told at {', '.join(f'{r.knob:g}' for r in told)}: {detected}" if told else "nothing to tell",
+                f"told at {', '.join(f'{r.knob:g}' for r in told)}: {detected}" if told else "the status: converged or budget",
                 cure,
             )
         )

@@ -40,11 +40,11 @@ def clamp(bench: Bench) -> Experiment:
             Limit(
                 name,
                 "negative lobes",
-                f"at most {100 * (worst.error or 0):.2g} % of the light is negative (at {worst.knob:g} steps), "
+                f"at most {100 * (worst.error or 0):.1f} % of the light is negative (at {worst.knob:g} steps), "
                 f"{100 * (own[-1].error or 0):.2g} % after {own[-1].knob:g}",
                 f"mean irradiance {own[-1].energy:.2f} times the truth in the end",
                 f"warning above 5 % ({len(told)} of {len(own)} settings here)",
-                "none needed" if not told else "clamp, or more steps",
+                "none needed" if not told else "more steps" + (", or the clamp" if "no clamp" in name else ""),
             )
         )
     return Experiment(

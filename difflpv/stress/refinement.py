@@ -58,7 +58,7 @@ def _refinement(bench: Bench, name: str, component: Component, what: str) -> Exp
     finding = (
         f"From {first}³ to {last}³ cells, worse: {', '.join(worse) or 'none'}; no worse: {', '.join(steady) or 'none'}. A "
         "published kernel diffuses: it carries light √steps cells, so that smaller cells keep it near where it began, and too "
-        "bright there; a learned stencil fails only where the scene spans more cells than it was trained for."
+        "bright there; a learned stencil knows the distances [cells] that it was trained for."
     )
     return Experiment(
         name,
