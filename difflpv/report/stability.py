@@ -68,7 +68,8 @@ def _draw_panel(axis: Axes, experiment: Mapping[str, Any], methods: Sequence[str
     if experiment["log_knob"]:
         _log_knob(axis, sorted({float(r["knob"]) for r in experiment["readings"]}))
     if experiment["categories"]:
-        axis.set_xticks(range(len(experiment["categories"])), experiment["categories"], fontsize=8)
+        names = [name.replace(" ", "\n") for name in experiment["categories"]]
+        axis.set_xticks(range(len(names)), names, fontsize=8)
     if log:
         axis.set_yscale("log")
     axis.set_ylim(low, high)
