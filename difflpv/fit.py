@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -28,6 +29,7 @@ __all__ = ["FitOutcome", "LightTarget", "Loss", "fit", "light_target", "score_li
 
 Loss = Literal["l2", "log", "image-l1", "image-ssim"]
 _BACKWARD_COST = 2.0  # forwards; benchmarks/propagation.py measures 1.2 to 1.9 for what is learned here
+_MOVED = "started from the critical propagation factor {limit:g}, because the solve overflows at the start given; "
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,6 +138,7 @@ def fit(
     budget: float = 60.0,
     seconds: float | None = None,
     seed: int = 0,
+    initial: Mapping[str, Any] | None = None,
     checkpoint: str | Path | None = None,
     callback: Callable[[HistoryPoint], None] | None = None,
     label: str = "",
@@ -156,15 +159,18 @@ def fit(
         budget: forward-equivalents, one being a solve of all train lights.
         seconds: wall-time limit.
         seed: of the solver.
+        initial: where to start, by name, instead of the learnables' own starts. Where the solve overflows there because the
+            propagation factor lies beyond its critical value, the fit starts from that value and says so.
         checkpoint: file that the solver writes and resumes from.
         callback: called with every evaluation.
         label: recognises a checkpoint of another fit.
         **options: of the solver.
 
     Returns:
-        The fitted model with its scores; an interrupted or failed fit returns the best so far.
+        The fitted model with its scores; an interrupted or failed fit returns the best finite point so far.
 
     Raises:
+        FloatingPointError: the solve is not finite where the fit starts, and the propagation factor is not to blame.
         ValueError: an empty or overlapping split, a light without a target, lights learned on several light sets, or
             albedo learned from the component "direct".
     """
@@ -182,32 +188,55 @@ def fit(
     learned_on = [by_index[k] for k in train]
     if "albedo" in learn and learned_on[0].illumination.component == "direct":
         raise ValueError("learn: 'albedo' has no part in component 'direct', fit it to 'bounce1'")
-    lpv = Lpv(learned_on[0].illumination.grid, config, learn=learn, scene=learned_on[0].illumination.scene)
+    first = learned_on[0].illumination
     measure = _image_loss(loss, learned_on) if loss.startswith("image") else _irradiance_loss(loss, learned_on)
 
-    def objective(values: dict[str, torch.Tensor]) -> torch.Tensor:
-        try:
-            return measure(lpv, values)
-        except FloatingPointError:  # the solver says at which parameter and step
-            return sum((v.sum() for v in values.values()), torch.zeros((), dtype=torch.float64)) * torch.nan
+    def problem_of(lpv: Lpv) -> Problem:
+        def objective(values: dict[str, torch.Tensor]) -> torch.Tensor:
+            try:
+                return measure(lpv, values)
+            except FloatingPointError:  # the solver says at which parameter and step
+                return sum((v.sum() for v in values.values()), torch.zeros((), dtype=torch.float64)) * torch.nan
 
-    def residual(values: dict[str, torch.Tensor]) -> torch.Tensor:
-        parts = [
-            (t.weight.sqrt()[:, None] * (lpv(t.illumination, t.receivers, values) - t.irradiance)).double().ravel()
-            for t in learned_on
-        ]
-        return torch.cat(parts)
+        def residual(values: dict[str, torch.Tensor]) -> torch.Tensor:
+            parts = [
+                (t.weight.sqrt()[:, None] * (lpv(t.illumination, t.receivers, values) - t.irradiance)).double().ravel()
+                for t in learned_on
+            ]
+            return torch.cat(parts)
 
-    problem = Problem(objective, lpv.described, backward_cost=_BACKWARD_COST, residual=residual, label=label)
-    result = solve(
-        problem, solver, budget=budget, seconds=seconds, seed=seed, checkpoint=checkpoint, callback=callback, **options
-    )
+        return Problem(objective, lpv.described, backward_cost=_BACKWARD_COST, residual=residual, label=label)
+
+    lpv = Lpv(first.grid, config, learn=learn, scene=first.scene, initial=initial)
+    moved, told = _start_within_the_limit(lpv, problem_of(lpv)), ""
+    if moved is not None:
+        lpv, told = Lpv(first.grid, config, learn=learn, scene=first.scene, initial={**(initial or {}), **moved}), _MOVED
+    options |= {"budget": budget, "seconds": seconds, "seed": seed, "checkpoint": checkpoint, "callback": callback}
+    result = solve(problem_of(lpv), solver, **options)
+    result = replace(result, message=told.format(limit=config.critical_factor) + result.message)
     lpv.set_values(result.parameters)
     untuned = Lpv(lpv.grid, config)
     scores: list[Score] = []
     for k in (*train, *test):
         scores += score_lights(by_index[k], {config.method: untuned, f"{config.method} fitted": lpv})
     return FitOutcome(lpv, result, tuple(train), tuple(test), tuple(scores))
+
+
+def _start_within_the_limit(lpv: Lpv, problem: Problem) -> dict[str, torch.Tensor] | None:
+    """Values of the propagation factors to start from instead, where it is them who make the start overflow; else None."""
+    limit = lpv.config.critical_factor
+    if not lpv.config.steps or float(lpv.step_factors().max()) <= limit:
+        return None
+    loss, gradient = problem.value_and_grad(problem.initial)
+    if math.isfinite(loss) and bool(gradient.isfinite().all()):
+        return None
+    start = {p.name: p.initial for p in lpv.described}
+    moved = {}
+    if "propagation" in start:
+        moved["propagation"] = start["propagation"].clamp(max=limit)
+    if "propagation_steps" in start:
+        moved["propagation_steps"] = start["propagation_steps"].clamp(max=1.0)
+    return moved or None
 
 
 @torch.no_grad()

@@ -26,7 +26,7 @@ from difflpv.grid import Grid
 from difflpv.occlusion import Blockers, blocking_potential, geometry_volume
 from difflpv.raycast import Raycaster
 from difflpv.rsm import Rsm, TexelFlux, render_rsm, rsm_blockers, rsm_vpls
-from difflpv.scene import AreaLight, Scene
+from difflpv.scene import AreaLight, Scene, SceneError
 from difflpv.stencil import FaceStencil
 from difflpv.surface import SurfaceSamples, sample_surfaces
 from difflpv.vpl import Vpls
@@ -34,6 +34,8 @@ from difflpv.vpl import Vpls
 __all__ = ["Component", "Illumination", "LightValues", "Receivers", "illuminate"]
 
 Component = Literal["direct", "bounce1"]
+_EXTENTS = (1e-5, 1e9)  # m; Embree and the fourth power of a distance in float32 set these
+_FARTHEST = 1e3  # distance from the origin over the extent; rays start 2e-5 of it off a surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,8 +191,10 @@ def illuminate(
         device: where the solve runs.
 
     Raises:
+        SceneError: a scene too small, too large or too far from the origin for the float32 of rays and form factors.
         ValueError: an unknown choice, or ``blockers="rsm"`` where no light has an RSM.
     """
+    _check_extent(scene)
     if component not in get_args(Component):
         raise ValueError(f"component: expected 'direct' or 'bounce1', got {component!r}")
     if blockers not in ("surface", "rsm"):
@@ -231,6 +235,23 @@ def illuminate(
     if component == "direct":
         rsms = ()
     return Illumination(component, scene, grid, emitters, samples, visible, rsms, potential, raycaster)
+
+
+def _check_extent(scene: Scene) -> None:
+    """Refuse what would come out dark or torn without a word (measured: docs/stability.md)."""
+    low, high = scene.bounds
+    extent, reach = float((high - low).max()), float(np.abs([low, high]).max())
+    smallest, largest = _EXTENTS
+    if not smallest <= extent <= largest:
+        raise SceneError(
+            f"scene '{scene.name}': {extent:.3g} m across, rays and form factors work from {smallest:g} to {largest:g} m: "
+            "rescale it to metres"
+        )
+    if reach > _FARTHEST * extent:
+        raise SceneError(
+            f"scene '{scene.name}': {extent:.3g} m across but {reach:.3g} m from the origin, more than {_FARTHEST:g} times its "
+            "size: float32 rays cannot tell its surfaces apart; move it to the origin"
+        )
 
 
 def _of_area_lights(scene: Scene, emitters: Emitters) -> torch.Tensor:

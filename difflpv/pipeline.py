@@ -89,6 +89,11 @@ class Lpv(torch.nn.Module):
         for parameter in self.described:
             getattr(self, f"raw_{parameter.name}").copy_(parameter.to_raw(parameter.nudge_inside(values[parameter.name])))
 
+    def step_factors(self, values: Mapping[str, torch.Tensor] | None = None) -> torch.Tensor:
+        """Propagation factor of each step [steps], float64, detached; ``values`` as in ``forward``."""
+        merged = {**self._fixed, **self.values(), **(values or {})}
+        return (merged["propagation"] * merged["propagation_steps"]).detach().double().cpu()
+
     def save(self, folder: str | Path, *, provenance: Mapping[str, Any] | None = None) -> None:
         """Write ``fitted.json`` and ``fitted.safetensors``; ``provenance`` says where the values come from."""
         values = {name: value.detach() for name, value in self.values().items()}

@@ -13,11 +13,11 @@ from difflpv.grid import Grid
 from difflpv.illumination import Component, Illumination, illuminate
 from difflpv.pipeline import Lpv
 from difflpv.scene import Camera, Scene
+from difflpv.trouble import describe_trouble
 
 __all__ = ["Prediction", "render", "simulate", "solve_irradiance"]
 
 _RECEIVERS_PER_CHUNK = 1 << 18
-_LOST_SHARE_TOLD = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,24 +39,8 @@ def solve_irradiance(lpv: Lpv, light: Illumination, position: np.ndarray, normal
     for begin in range(0, max(len(position), 1), _RECEIVERS_PER_CHUNK):
         rows = slice(begin, begin + _RECEIVERS_PER_CHUNK)
         parts.append(lpv(light, light.receivers(position[rows], normal[rows])).cpu().numpy())
-    return Prediction(np.concatenate(parts).astype(np.float64), _told(lpv, light, position))
-
-
-def _told(lpv: Lpv, light: Illumination, position: np.ndarray) -> tuple[str, ...]:
-    lines = []
-    if lpv.report is not None and float(lpv.report.lost_share) > _LOST_SHARE_TOLD:
-        lines.append(
-            f"the grid {_corner(lpv.grid.minimum)} .. {_corner(lpv.grid.maximum)} m does not contain the scene: "
-            f"{int(lpv.report.lost_count)} VPLs with {100 * float(lpv.report.lost_share):.3g} % of the flux are lost"
-        )
-    outside = int((~lpv.grid.contains(position)).sum())
-    if outside:
-        lines.append(f"{outside} of {len(position)} receivers lie outside the grid and read its edge cells")
-    return tuple(lines)
-
-
-def _corner(values: tuple[float, float, float]) -> str:
-    return "(" + ", ".join(f"{v:.4g}" for v in values) + ")"
+    irradiance = np.concatenate(parts).astype(np.float64)
+    return Prediction(irradiance, describe_trouble(lpv, light, position, normal, irradiance))
 
 
 def simulate(

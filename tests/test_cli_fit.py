@@ -12,7 +12,7 @@ from difflpv.fitted import read_fitted
 from difflpv.io import load_scene
 from difflpv.pipeline import Lpv
 
-QUICK = ["--steps", 3, "--budget", 18]
+QUICK = ["--steps", 4, "--budget", 18]
 
 
 @pytest.fixture(scope="module")
@@ -78,13 +78,13 @@ def test_fitted_models_carry_over(room, tmp_path, capsys):
     table = room / "targets" / "light_0.npz"
     common = ["simulate", "--fitted", out, "--receivers", table, "--out", tmp_path / "p.npz"]
     assert difflpv(*common, room / "room.glb") == 0 and "grid 6 x 6 x 6" in capsys.readouterr().out
-    assert difflpv(*common, room / "room.glb", "--grid", 9, "--steps", 3) == 0
+    assert difflpv(*common, room / "room.glb", "--grid", 9, "--steps", 4) == 0
     assert "holpv fitted, grid 9 x 9 x 9 cells" in capsys.readouterr().out
     other = write_room(tmp_path, "moved", grid_low=(-1.6, -1.5, -0.6))
     content, _ = run_json(capsys, *common, other)
     assert content["method"] == "holpv fitted"
     for arguments, message in (
-        (["--steps", 4], f"--steps 4: the fitted model in {out} has steps 3"),
+        (["--steps", 5], f"--steps 5: the fitted model in {out} has steps 4"),
         (["--method", "lpv"], f"--method lpv: the fitted model in {out} has method holpv"),
         (["--no-clamp"], f"--no-clamp: the fitted model in {out} has clamp True"),
     ):

@@ -208,7 +208,7 @@ def test_bad_files(room, table, tmp_path, capsys):
         (["simulate", scene, "--receivers", "none.npz", "--out", "p.npz"], "none.npz: no such file"),
         (["simulate", scene, "--receivers", scene, "--out", "p.npz"], "not a readable .npz table"),
         (["simulate", scene, "--receivers", table, "--out", "p.csv"], "--out: expected a file name ending in .npz, got p.csv"),
-        (["simulate", scene, "--receivers", table, "--out", tmp_path / "file" / "p.npz", "--steps", 1], "--out: folder"),
+        (["simulate", scene, "--receivers", table, "--out", tmp_path / "file" / "p.npz", "--steps", 4], "--out: folder"),
         (["simulate", scene, "--receivers", tmp_path / "long.npz", "--out", "p.npz"], "normal: expected unit length, row 0"),
         (["render", scene, "--out", "p.png"], "--out: expected a file name ending in .exr, got p.png"),
         (["render", scene, "--camera", 3, "--out", "p.exr"], "--camera: 3 is out of range, scene 'room' has 1 camera(s)"),

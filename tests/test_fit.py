@@ -169,6 +169,41 @@ def test_a_fit_that_overflows_says_where():
     assert outcome.lpv.values()["propagation"].item() == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize(("start", "moved"), [(1.02, False), (1.9, True)])
+def test_a_fit_that_starts_beyond_the_limit(start, moved):
+    """600 steps at 1.02 grow and can be fitted; at 1.9 they overflow float32, and the fit starts from 1 instead.
+
+    Either may still be stopped by a trial of the line search beyond the limit: what counts is the best finite point.
+    """
+    config = LpvConfig(method="lpv", steps=600)
+    scene, targets = targets_of(config, {"propagation": 0.9}, dtype=torch.float32)
+    options = {"learn": ["propagation"], "train": [0], "test": [], "initial": {"propagation": start}, "budget": 45}
+    outcome = fit(scene, targets, config=config, **options)
+    assert ("started from the critical propagation factor 1, because" in outcome.result.message) is moved
+    assert outcome.result.loss < 0.5 * outcome.result.history[0].loss
+    assert outcome.lpv.values()["propagation"].item() < 1
+    assert all(np.isfinite(s.relative_l2) for s in outcome.scores)
+
+
+def test_step_factors_that_overflow_are_moved_too():
+    config = LpvConfig(method="lpv", steps=600)
+    scene, targets = targets_of(config, {"propagation_steps": np.full(600, 0.9)}, dtype=torch.float32)
+    options = {"learn": ["propagation_steps"], "train": [0], "test": [], "budget": 6}
+    outcome = fit(scene, targets, config=config, initial={"propagation_steps": np.full(600, 1.9)}, **options)
+    assert "started from the critical propagation factor" in outcome.result.message and np.isfinite(outcome.result.loss)
+
+
+@pytest.mark.parametrize(("rate", "diverged"), [(0.1, False), (50.0, True)])
+def test_adam_says_when_a_large_step_threw_it_out(rate, diverged):
+    config = LpvConfig(method="lpv", steps=60)
+    scene, targets = targets_of(config, {"propagation": 1.01})
+    options = {"learn": ["propagation"], "train": [0], "test": [], "solver": "adam", "lr": rate, "budget": 60}
+    outcome = fit(scene, targets, config=config, **options)
+    first, last = outcome.result.history[0].loss, outcome.result.history[-1].loss
+    assert outcome.result.loss <= first and (last > 1e3 * first) is diverged
+    assert ("adam: diverged from a loss of" in outcome.result.message) is diverged
+
+
 def test_splits_and_losses_that_cannot_be():
     scene, targets = targets_of(CONFIG, {"propagation": 0.8}, count=2)
     base = {"config": CONFIG, "learn": ["propagation"], "budget": 10}

@@ -67,9 +67,9 @@ LAYERS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ),
     ("optim", ("difflpv.optim",)),
     ("data_gen", ("data_gen",)),
-    ("jobs", ("difflpv.evaluate", "difflpv.fit", "difflpv.simulate", "difflpv.training")),
+    ("jobs", ("difflpv.evaluate", "difflpv.fit", "difflpv.simulate", "difflpv.training", "difflpv.trouble")),
     ("report", ("difflpv.report",)),
-    ("demo", ("difflpv.demo",)),
+    ("demo", ("difflpv.demo", "difflpv.stress")),
     ("cli", ("difflpv.cli",)),
     ("scripts", ("scripts",)),
 )
@@ -121,7 +121,7 @@ ONLY = (
 )
 
 # Only these parts may know the path tracer: what they judge must not.
-DATA_GEN_USERS = ("data_gen", "difflpv.cli", "difflpv.demo", "scripts")
+DATA_GEN_USERS = ("data_gen", "difflpv.cli", "difflpv.demo", "difflpv.stress", "scripts")
 
 LIBRARY_OWNERS: dict[str, tuple[str, ...]] = {
     "warp": ("warp_kernels", "difflpv.bridge", "difflpv.face_propagation"),
@@ -130,6 +130,7 @@ LIBRARY_OWNERS: dict[str, tuple[str, ...]] = {
     "trimesh": ("difflpv.io.obj", "difflpv.io.ply", "difflpv.io.gltf"),
     "embreex": ("difflpv.raycast",),
     "nlopt": ("difflpv.optim.nlopt_solver",),
+    "cma": ("difflpv.optim.cma_solver",),
     "kornia": ("difflpv.loss",),
     "safetensors": ("difflpv.fitted", "difflpv.stencil_files"),
     "matplotlib": ("difflpv.report", "scripts"),

@@ -135,6 +135,8 @@ def box():
         ("lbfgs", dict(memory=0), "memory, patience: expected at least 1, got 0, 2"),
         ("nlopt-bobyqa", dict(initial_step=0.9), "initial_step: expected a share"),
         ("nlopt-crs2", dict(population=2), "population: expected more than 2 points, got 2"),
+        ("cma", dict(initial_step=0.0), r"initial_step: expected a share in \(0, 0.5\], got 0"),
+        ("cma", dict(population=1), "population: expected at least 2 points, got 1"),
         ("nnls", {}, "problem: expected one made with residual"),
     ],
 )
@@ -155,3 +157,9 @@ def test_every_status_has_advice():
 def test_naming_the_solvers_loads_neither_torch_nor_warp():
     code = "import sys, difflpv, difflpv.optim; assert not {'torch', 'warp', 'scipy', 'nlopt'} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+def test_cma_that_is_not_installed_says_how(monkeypatch):
+    monkeypatch.setitem(sys.modules, "cma", None)
+    with pytest.raises(ValueError, match=r"'cma' needs the optional package cma: pip install 'difflpv\[cma\]'"):
+        solve(two(), "cma", budget=100)

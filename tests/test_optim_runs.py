@@ -70,7 +70,7 @@ def test_time_limit(solver):
         return (p["x"] ** 2).sum()
 
     problem = Problem(slow, [Parameter("x", [0.5, 0.4], -1, 1)])
-    result = solve(problem, solver, budget=1e4, seconds=0.05, tolerance=0, **adam_steps(solver))
+    result = solve(problem, solver, budget=1e4, seconds=0.03, tolerance=0, **adam_steps(solver))
     assert result.status is Status.TIME_LIMIT and 1 <= result.evaluations <= 4
     assert math.isfinite(result.loss)
 
@@ -309,3 +309,24 @@ def test_callback_sees_every_evaluation_and_may_interrupt():
 
         result = solve(make(), solver, budget=100, tolerance=0, callback=watch)
         assert result.status is Status.INTERRUPTED and tuple(seen) == result.history
+
+
+def valley(p):
+    """With a plateau around it."""
+    return (1 - torch.exp(-(p["x"] ** 2))).sum()
+
+
+def bowl(p):
+    """Steeper and steeper."""
+    return (p["x"] ** 4).sum()
+
+
+@pytest.mark.parametrize(
+    ("loss", "rate", "word"),
+    [(valley, 0.1, None), (valley, 30.0, "no step of 29"), (bowl, 0.1, None), (bowl, 30.0, "diverged from a loss of 1 to")],
+)
+def test_adam_says_when_its_step_size_loses_the_valley(loss, rate, word):
+    result = solve(Problem(loss, [Parameter("x", [1.0])]), "adam", budget=90, lr=rate, schedule="constant")
+    assert ("lower the step size (adam: " in result.message) is (word is not None)
+    assert word is None or f"adam: {word}" in result.message
+    assert result.loss <= result.history[0].loss

@@ -23,6 +23,7 @@ ROSENBROCK = {
     "nlopt-crs2": (3000, 1e-2),
     "nlopt-mma": (3000, 0.3),
     "nlopt-lbfgs": (300, 1e-5),
+    "cma": (1500, 1e-4),
 }
 
 

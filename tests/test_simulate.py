@@ -67,7 +67,8 @@ def test_a_grid_that_does_not_contain_the_scene():
     half = Grid((-1.2, -1.2, -1.2), 0.4, (3, 6, 6))
     position = np.array([[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0], [0.2, 0.0, 0.0]])
     scene = panel_scene(floor=2.0)
-    prediction = simulate(scene, position, np.tile([0.0, 1, 0], (3, 1)), grid=half, config=CONFIG, component="direct")
+    normal, config = np.tile([0.0, 1, 0], (3, 1)), LpvConfig(steps=6)
+    prediction = simulate(scene, position, normal, grid=half, config=config, component="direct")
     assert len(prediction.warnings) == 2
     assert "m does not contain the scene: 32 VPLs with 50 % of the flux are lost" in prediction.warnings[0]
     assert prediction.warnings[1] == "2 of 3 receivers lie outside the grid and read its edge cells"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from PIL import Image
 from difflpv.io.atomic import atomic_path
 from difflpv.io.srgb import linear_to_srgb
 
-__all__ = ["auto_exposure", "tone_map", "write_png"]
+__all__ = ["auto_exposure", "shrink_png", "tone_map", "write_png"]
 
 
 def auto_exposure(rgb: np.ndarray, *, percentile: float = 98.0) -> float:
@@ -43,3 +44,12 @@ def write_png(path: str | Path, rgb: np.ndarray, *, exposure: float | None = Non
     mapped = tone_map(rgb, exposure=auto_exposure(rgb) if exposure is None else exposure)
     with atomic_path(path) as temporary:
         Image.fromarray(mapped).save(temporary, format="PNG")
+
+
+def shrink_png(png: bytes, *, colors: int = 32) -> bytes:
+    """The same picture with a palette of its own: a third of the size of a chart, which has few colours anyway."""
+    target = io.BytesIO()
+    with Image.open(io.BytesIO(png)) as image:
+        few = image.convert("RGB").quantize(colors, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+        few.save(target, format="PNG", optimize=True)
+    return target.getvalue()

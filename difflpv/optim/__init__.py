@@ -34,6 +34,7 @@ SOLVERS: dict[str, Callable[..., OptimResult]] = {
     "lbfgs": _solver("lbfgs", "solve_lbfgs"),
     "nnls": _solver("nnls", "solve_nnls"),
 } | {f"nlopt-{name}": _nlopt(f"nlopt-{name}") for name in ("bobyqa", "sbplx", "cobyla", "crs2", "mma", "lbfgs")}
+SOLVERS["cma"] = _solver("cma_solver", "solve_cma")  # an extra: pip install 'difflpv[cma]'
 
 
 def solve(problem: Problem, solver: str, **options: Any) -> OptimResult:

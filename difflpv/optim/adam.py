@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from dataclasses import replace
 from typing import Literal
 
 import torch
@@ -13,6 +14,8 @@ from difflpv.optim.result import OptimResult, Status
 from difflpv.optim.run import Callback, Run
 
 __all__ = ["solve_adam"]
+
+_DIVERGED = 10.0  # times the first loss
 
 
 def solve_adam(
@@ -112,4 +115,17 @@ def solve_adam(
             reference = [reference_loss, reference_step]
             run.mark({"raw": raw, "optimizer": optimizer.state_dict(), "reference": reference})
 
-    return run.execute(loop)
+    return _say_if_lost(run.execute(loop))
+
+
+def _say_if_lost(result: OptimResult) -> OptimResult:
+    """A step size that throws the search out of its valley ends far above its start; the best point is still what returns."""
+    losses = [point.loss for point in result.history if math.isfinite(point.loss)]
+    if result.status not in (Status.BUDGET, Status.TIME_LIMIT, Status.CONVERGED) or not losses:
+        return result
+    told = ""
+    if losses[-1] > _DIVERGED * abs(losses[0]):
+        told = f"diverged from a loss of {losses[0]:.3g} to {losses[-1]:.3g}, the best ({result.loss:.3g}) is returned"
+    elif len(losses) > 2 and result.loss == losses[0] > 0:
+        told = f"no step of {len(losses) - 1} came below the start's loss of {losses[0]:.3g}"
+    return replace(result, message=f"adam: {told}: lower the step size ({result.message})") if told else result

@@ -12,9 +12,9 @@ import os
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
+from difflpv.optim.box import Box
 from difflpv.optim.problem import Problem
 from difflpv.optim.result import OptimResult, Status
 from difflpv.optim.run import Callback, Run, StopRun
@@ -99,7 +99,7 @@ def solve_nlopt(
         callback=callback,
         options={"initial_step": initial_step, "population": population},
     )
-    box = _Box(problem)
+    box = Box(problem)
     objective = _Objective(run, box, with_gradient)
     optimizer = nlopt.opt(getattr(nlopt, NLOPT_ALGORITHMS[algorithm]), problem.size)
     optimizer.set_min_objective(objective)
@@ -121,50 +121,26 @@ def solve_nlopt(
         try:
             optimizer.optimize(start)
         except nlopt.RoundoffLimited:
-            return Status.ROUNDOFF_LIMITED, objective.told("rounding errors limit the progress")
+            return Status.ROUNDOFF_LIMITED, run.told("rounding errors limit the progress")
         except Exception as error:
             # Whatever left the objective goes on as it is; the rest is NLopt's own way of giving up.
             if objective.raised is not None:
                 raise objective.raised from None
-            return Status.FAILED, objective.told(f"NLopt gave up ({optimizer.get_errmsg() or type(error).__name__})")
+            return Status.FAILED, run.told(f"NLopt gave up ({optimizer.get_errmsg() or type(error).__name__})")
         if objective.raised is not None:
             raise objective.raised
         code = optimizer.last_optimize_result()
         if code == nlopt.MAXTIME_REACHED:
             return Status.TIME_LIMIT, ""
-        return Status.CONVERGED, objective.told(f"converged after {run.step} evaluations")
+        return Status.CONVERGED, run.told(f"converged after {run.step} evaluations")
 
     return run.execute(loop)
-
-
-class _Box:
-    """Scaled coordinates: [0, 1] over an interval, distance from the bound or from 0 over the scale elsewhere."""
-
-    def __init__(self, problem: Problem) -> None:
-        origin, scale = {}, {}
-        for p in problem.parameters:
-            free = torch.zeros_like(p.initial)
-            origin[p.name] = {"free": free, "below": p.upper}.get(p.map, p.lower)
-            scale[p.name] = p.upper - p.lower if p.map == "interval" else free + float(p.scale or 1.0)
-        self._low, self._high = problem.lower.numpy(), problem.upper.numpy()
-        self._origin, self._scale = problem.pack(origin).numpy(), problem.pack(scale).numpy()
-        self.lower = (self._low - self._origin) / self._scale
-        self.upper = (self._high - self._origin) / self._scale
-
-    def to_unit(self, x: Tensor) -> np.ndarray:
-        return np.clip((x.numpy() - self._origin) / self._scale, self.lower, self.upper)
-
-    def to_physical(self, u: np.ndarray) -> Tensor:
-        return torch.from_numpy(np.clip(self._origin + self._scale * u, self._low, self._high))
-
-    def gradient(self, gradient: Tensor) -> np.ndarray:
-        return gradient.numpy() * self._scale
 
 
 class _Objective:
     """NLopt's callback: a plain float for every call, whatever the loss does."""
 
-    def __init__(self, run: Run, box: _Box, with_gradient: bool) -> None:
+    def __init__(self, run: Run, box: Box, with_gradient: bool) -> None:
         self._run, self._box, self._with_gradient = run, box, with_gradient
         self._first: tuple[bytes, float, np.ndarray | None] | None = None
         self._penalty = 0.0
@@ -175,11 +151,6 @@ class _Objective:
         loss, gradient = self._evaluate(x, refuse=True)
         self._first = u.tobytes(), loss, gradient
 
-    def told(self, detail: str) -> str:
-        """The message, with the number of penalties that the algorithm met."""
-        bad = sum(math.isnan(point.loss) for point in self._run.history)
-        return f"{detail}, {bad} of {len(self._run.history)} evaluations were not finite" if bad else detail
-
     def __call__(self, u: np.ndarray, gradient: np.ndarray) -> float:
         # CRS2 goes on calling while it builds its population, whatever was raised before.
         if self.raised is not None:
@@ -188,7 +159,7 @@ class _Objective:
             # NLopt reuses the memory behind u; BOBYQA may leave the box by a rounding error.
             u = np.clip(np.array(u), self._box.lower, self._box.upper)
             if not np.isfinite(u).all():  # COBYLA, once its simplex has collapsed
-                raise StopRun(Status.ROUNDOFF_LIMITED, self.told("the algorithm proposed a point that is not finite"))
+                raise StopRun(Status.ROUNDOFF_LIMITED, self._run.told("the algorithm proposed a point that is not finite"))
             if self._first is not None and self._first[0] == u.tobytes():
                 (_, loss, slope), self._first = self._first, None
             else:

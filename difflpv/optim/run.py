@@ -151,6 +151,11 @@ class Run:
         cause = "because of parameter" if names else "at"
         return StopRun(Status.NON_FINITE, f"{what} at step {self.step}, {cause} {named}")
 
+    def told(self, detail: str) -> str:
+        """``detail``, with the number of evaluations that were not finite where there were any."""
+        bad = sum(math.isnan(point.loss) for point in self.history)
+        return f"{detail}, {bad} of {len(self.history)} evaluations were not finite" if bad else detail
+
     def mark(self, state: dict[str, Any] | None) -> None:
         """Note a completed step: a checkpoint, whenever it is written, continues from the last one noted.
 

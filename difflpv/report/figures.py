@@ -5,21 +5,19 @@ matplotlib is imported when the first figure is drawn, and its global state is l
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from difflpv.io.png import auto_exposure, tone_map
+from difflpv.report.style import DPI, axes_in_row, new_figure, png_bytes, title_axis
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 __all__ = ["draw_convergence", "draw_factors", "draw_lights", "draw_renders"]
 
-_DPI = 150
 _CELL = 2.35  # width of a picture [inches]
 _SIGNED = "RdBu_r"
 _ERROR_RANGE = 2.0  # of the error maps, in means of the path-traced image
@@ -47,7 +45,7 @@ def draw_renders(
     hit: np.ndarray,
     captions: Mapping[str, str],
     *,
-    dpi: int = _DPI,
+    dpi: int = DPI,
 ) -> bytes:
     """The path-traced image beside predictions, all under its exposure, and the signed error beneath each prediction.
 
@@ -64,7 +62,7 @@ def draw_renders(
     mean = float(truth[hit].mean()) if hit.any() else 0.0
     height, width = hit.shape
     columns = 1 + len(predicted)
-    figure = _figure(_CELL * columns, 2 * 0.97 * _CELL * height / width + 0.7, dpi=dpi)
+    figure = new_figure(_CELL * columns, 2 * 0.97 * _CELL * height / width + 0.7, dpi=dpi)
     axes = figure.subplots(2, columns, squeeze=False)
     for axis in axes.ravel():
         axis.set(xticks=[], yticks=[])
@@ -79,7 +77,7 @@ def draw_renders(
         axis.imshow(error, cmap=_SIGNED, norm=scale, interpolation="nearest")
         axis.set_xlabel(captions.get(name, ""), fontsize=10)
     _color_bar(axes[1, 0], scale, height / width)
-    return _png(figure)
+    return png_bytes(figure)
 
 
 def _color_bar(axis: Axes, scale: Any, aspect: float) -> None:
@@ -106,8 +104,8 @@ def draw_convergence(fits: Mapping[str, Mapping[str, Any]], constant: float) -> 
         fits: by name; ``history`` has rows of (forward-equivalents, seconds, loss), ``solver`` names who searched.
         constant: loss of the constant prediction.
     """
-    figure = _figure(11.0, 4.6)
-    axes = _row(figure, 2, sharey=True)
+    figure = new_figure(11.0, 4.6)
+    axes = axes_in_row(figure, 2, sharey=True)
     losses = [row[2] for fit in fits.values() for row in fit["history"] if row[2] is not None]
     best, start = min(losses, default=constant), max((f["history"][0][2] or constant for f in fits.values()), default=constant)
     low, high = 0.93 * min(best, constant), 1.35 * max(start, constant)
@@ -133,9 +131,9 @@ def draw_convergence(fits: Mapping[str, Mapping[str, Any]], constant: float) -> 
         axis.set_xlabel(label)
     _loss_ticks(axes[0], low, high)
     axes[0].set_ylabel("mean relative L2 of the train lights")
-    _title(axes[0], "by work")
-    _title(axes[1], "by time on this machine")
-    return _png(figure)
+    title_axis(axes[0], "by work")
+    title_axis(axes[1], "by time on this machine")
+    return png_bytes(figure)
 
 
 def draw_lights(scores: Sequence[Mapping[str, Any]], train: Sequence[int], test: Sequence[int], noise: float) -> bytes:
@@ -147,8 +145,8 @@ def draw_lights(scores: Sequence[Mapping[str, Any]], train: Sequence[int], test:
         test: light sets judged on.
         noise: relative L2 error of a perfect prediction, from the targets' own noise.
     """
-    figure = _figure(9.5, 4.4)
-    (axis,) = _row(figure, 1)
+    figure = new_figure(9.5, 4.4)
+    (axis,) = axes_in_row(figure, 1)
     order = [*train, *test]
     ends = []
     methods = [m for m in _MARKERS if any(s["method"] == m for s in scores)]
@@ -183,7 +181,7 @@ def draw_lights(scores: Sequence[Mapping[str, Any]], train: Sequence[int], test:
     axis.set_xlabel("light set")
     axis.set_ylabel("relative L2 of irradiance")
     _loss_ticks(axis, low, high)
-    return _png(figure)
+    return png_bytes(figure)
 
 
 def draw_factors(factors: Mapping[str, Sequence[float]]) -> bytes:
@@ -194,8 +192,8 @@ def draw_factors(factors: Mapping[str, Sequence[float]]) -> bytes:
     """
     from matplotlib.ticker import LogLocator, NullLocator
 
-    figure = _figure(11.0, 3.6)
-    left, right = _row(figure, 2)
+    figure = new_figure(11.0, 3.6)
+    left, right = axes_in_row(figure, 2)
     products = {name: np.cumprod(np.maximum(values, 1e-12)) for name, values in factors.items()}
     count = max(len(values) for values in factors.values())
     for axis, curves, title in ((left, factors, "factor of each step"), (right, products, "product of the factors so far")):
@@ -204,7 +202,7 @@ def draw_factors(factors: Mapping[str, Sequence[float]]) -> bytes:
         axis.plot([0, count], [1, 1], color="#777777", linewidth=1, linestyle=":")
         axis.set_xlim(0, 1.3 * count)
         axis.set_xlabel("propagation step")
-        _title(axis, title)
+        title_axis(axis, title)
     left.set_ylim(0, 1.12 * max(1.0, *(max(v) for v in factors.values())))
     right.set_yscale("log")
     every = np.concatenate([*products.values(), np.ones(1)])
@@ -215,33 +213,7 @@ def draw_factors(factors: Mapping[str, Sequence[float]]) -> bytes:
         ends = [(len(v), float(v[-1]), name, _COLORS.get(name, "#333333")) for name, v in curves.items()]
         ends.append((count, 1.0, "as published", "#777777"))
         _label_ends(axis, ends, *axis.get_ylim(), gap=0.02 * count, log=axis is right)
-    return _png(figure)
-
-
-def _figure(width: float, height: float, *, dpi: int = _DPI) -> Figure:
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width, height), dpi=dpi, layout="constrained", facecolor="white")
-
-
-def _row(figure: Figure, count: int, *, sharey: bool = False) -> list[Axes]:
-    """Axes side by side: no box, quiet ticks."""
-    axes = list(figure.subplots(1, count, sharey=sharey, squeeze=False)[0])
-    for axis in axes:
-        axis.spines[["top", "right"]].set_visible(False)
-        axis.spines[["left", "bottom"]].set_color("#777777")
-        axis.tick_params(which="both", color="#777777", labelcolor="#444444")
-    return axes
-
-
-def _title(axis: Axes, text: str) -> None:
-    axis.set_title(text, loc="left", fontsize=10.5, fontweight="bold", color="#333333")
-
-
-def _png(figure: Figure) -> bytes:
-    target = io.BytesIO()
-    figure.savefig(target, format="png", metadata={"Software": ""}, pil_kwargs={"optimize": True})
-    return target.getvalue()
+    return png_bytes(figure)
 
 
 def _label_ends(
