@@ -6,6 +6,8 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, get_args
 
 from difflpv.grid import Grid
+from difflpv.injection import Deposit
+from difflpv.lookup import Lookup
 from difflpv.scene import Scene
 from difflpv.stencil import FaceStencil, LinearStencil, Normalization, Reprojection, holpv_stencil, lpv_stencil
 from difflpv.stencil_files import LEARNED_STENCILS, learned_stencil
@@ -15,7 +17,7 @@ __all__ = ["METHODS", "OCCLUSION_CHOICES", "LpvConfig", "Method", "Occlusion", "
 Method = Literal[
     "lpv", "holpv", "learned_4x6", "learned_9x6", "learned_4x26", "learned_9x26", "learned_16x26"
 ]
-Occlusion = Literal["none", "clamp", "exp"]
+Occlusion = Literal["none", "clamp", "exp", "traced"]
 METHODS: tuple[str, ...] = get_args(Method)
 OCCLUSION_CHOICES: tuple[str, ...] = get_args(Occlusion)
 _DEFAULT_CELLS = 32
@@ -27,36 +29,59 @@ class LpvConfig:
 
     Attributes:
         method: "lpv" (30 faces, l_max 1), "holpv" (54 faces, l_max 2), or a learned stencil, "learned_<K>x<neighbours>".
-            A learned one is linear: ``clamp`` is off, and it takes no occlusion.
+            A learned one is linear: ``clamp`` is off.
         steps: propagation steps.
-        occlusion: "none", or the geometry volume with "clamp" (publications) or "exp" (smooth).
+        occlusion: "none"; the geometry volume with "clamp" (publications) or "exp" (smooth); or "traced", the share of free
+            rays between neighbouring cells (``difflpv.traced``). Default None: "traced" for learned stencils, else "none".
+        lookup: cells that a receiver may read: "trilinear", all eight (publications), or "damped" beside it
+            (``difflpv.damping``); "front", those in front of its plane; "visible", those in its sight;
+            "affine", an affine fit to those of 27 in its sight (``difflpv.lookup``). Default None: "affine" for learned
+            stencils, else "trilinear".
         normalization: "energy" keeps an isotropic field's flux, "thesis" a quarter of it per step.
         reprojection: lobe along the "face" normal or the "ray".
         clamp: negative intensity carries no flux; False makes transport linear.
-        deposit: VPLs go to the "nearest" cell or "trilinear" (differentiable in position).
-        occlude_first_step: the publications leave the first step unoccluded.
+        deposit: VPLs go to the "nearest" cell, to eight by "trilinear" weights (differentiable in position), or to those of
+            the eight that they see ("visible", differentiable too). Default None: "visible" for learned stencils, else
+            "nearest".
+        occlude_first_step: the publications leave the first step unoccluded. Default None: True with "traced" occlusion,
+            which has no self-shadowing to avoid, else False.
         l_max: SH degree, None for the method's own.
         tolerance: stop when the moving flux falls below this share (0: never).
+        coarsen_after: after so many steps (which are taken twice, to tell what still moves) light goes on in cells of twice
+            the edge, where a step is an eighth of the work and goes twice as far; receivers read both grids, and
+            ``tolerance`` counts on each by itself. None, or no step left: one grid.
     """
 
     method: Method = "holpv"
     steps: int = 32
-    occlusion: Occlusion = "none"
+    occlusion: Occlusion | None = None
     normalization: Normalization = "energy"
     reprojection: Reprojection = "face"
     clamp: bool = True
-    deposit: Literal["nearest", "trilinear"] = "nearest"
-    occlude_first_step: bool = False
+    deposit: Deposit | None = None
+    occlude_first_step: bool | None = None
     l_max: int | None = None
     tolerance: float = 0.0
+    lookup: Lookup | None = None
+    coarsen_after: int | None = None
 
     def __post_init__(self) -> None:
+        learned = self.method in LEARNED_STENCILS
+        if self.occlusion is None:
+            object.__setattr__(self, "occlusion", "traced" if learned else "none")
+        if self.lookup is None:
+            object.__setattr__(self, "lookup", "affine" if learned else "trilinear")
+        if self.deposit is None:
+            object.__setattr__(self, "deposit", "visible" if learned else "nearest")
+        if self.occlude_first_step is None:
+            object.__setattr__(self, "occlude_first_step", self.occlusion == "traced")
         choices = {
             "method": METHODS,
             "occlusion": OCCLUSION_CHOICES,
             "normalization": get_args(Normalization),
             "reprojection": get_args(Reprojection),
-            "deposit": ("nearest", "trilinear"),
+            "deposit": get_args(Deposit),
+            "lookup": get_args(Lookup),
         }
         for name, allowed in choices.items():
             if getattr(self, name) not in allowed:
@@ -65,14 +90,16 @@ class LpvConfig:
             raise ValueError(f"steps: expected a number >= 0, got {self.steps}")
         if not self.tolerance >= 0:
             raise ValueError(f"tolerance: expected a number >= 0, got {self.tolerance}")
-        if self.method in LEARNED_STENCILS:
+        if self.coarsen_after is not None and self.coarsen_after < 1:
+            raise ValueError(f"coarsen_after: expected at least 1 step, got {self.coarsen_after}")
+        if learned:
             object.__setattr__(self, "clamp", False)
             self._check_learned()
         _ = self.stencil
 
     def _check_learned(self) -> None:
         own = learned_stencil(self.method).l_max
-        needed = {"occlusion": "none", "normalization": "energy", "reprojection": "face"}
+        needed = {"normalization": "energy", "reprojection": "face"}
         for name, value in needed.items():
             if getattr(self, name) != value:
                 raise ValueError(f"{name}: the linear stencil '{self.method}' needs '{value}', got {getattr(self, name)!r}")
@@ -92,6 +119,15 @@ class LpvConfig:
     def critical_factor(self) -> float:
         """Propagation factor above which a uniform field grows without bound: 1 (energy) or 4 (thesis)."""
         return 1.0 if self.normalization == "energy" else 4.0
+
+    def grids(self, grid: Grid) -> tuple[Grid, ...]:
+        """The grids of a solve on ``grid``, finest first: itself and, with ``coarsen_after``, one of twice the cell."""
+        return (grid, grid.coarser()) if self.fine_steps < self.steps else (grid,)
+
+    @property
+    def fine_steps(self) -> int:
+        """Steps on the finest grid."""
+        return self.steps if self.coarsen_after is None else min(self.coarsen_after, self.steps)
 
     def to_json(self) -> dict[str, Any]:
         """Plain values, for ``from_json``."""

@@ -16,7 +16,7 @@ from difflpv.config import LpvConfig
 from difflpv.evaluate import Score, mean_score, predict_constant, score
 from difflpv.grid import Grid
 from difflpv.illumination import Component, Illumination, Receivers, illuminate
-from difflpv.learnables import SCENE_LEARNABLES
+from difflpv.learnables import CELL_LEARNABLES, SCENE_LEARNABLES
 from difflpv.lights import apply_light_set
 from difflpv.loss import image_l1, image_ssim, log_l2, relative_l2
 from difflpv.optim import solve
@@ -135,6 +135,7 @@ def fit(
     test: Sequence[int],
     solver: str = "lbfgs",
     loss: Loss = "l2",
+    sparsity: float = 0.0,
     budget: float = 60.0,
     seconds: float | None = None,
     seed: int = 0,
@@ -156,6 +157,7 @@ def fit(
         solver: a name of ``difflpv.optim.SOLVERS``.
         loss: "l2" (area-weighted relative), "log", or "image-l1" and "image-ssim" on the camera view; the mean over the
             train lights.
+        sparsity: weight of the mean |log f| of per-cell fields f in the loss: cells that gain nothing stay at 1.
         budget: forward-equivalents, one being a solve of all train lights.
         seconds: wall-time limit.
         seed: of the solver.
@@ -191,10 +193,15 @@ def fit(
     first = learned_on[0].illumination
     measure = _image_loss(loss, learned_on) if loss.startswith("image") else _irradiance_loss(loss, learned_on)
 
+    fields = [name for name in learn if name in CELL_LEARNABLES]
+    if not sparsity >= 0 or (sparsity and not fields):
+        raise ValueError(f"sparsity: expected 0, or a number above it with {' or '.join(CELL_LEARNABLES)}, got {sparsity}")
+
     def problem_of(lpv: Lpv) -> Problem:
         def objective(values: dict[str, torch.Tensor]) -> torch.Tensor:
+            penalty = sum((values[name].log().abs().mean() for name in fields), torch.zeros((), dtype=torch.float64))
             try:
-                return measure(lpv, values)
+                return measure(lpv, values) + sparsity * penalty
             except FloatingPointError:  # the solver says at which parameter and step
                 return sum((v.sum() for v in values.values()), torch.zeros((), dtype=torch.float64)) * torch.nan
 

@@ -9,6 +9,8 @@ import numpy as np
 
 __all__ = ["Grid"]
 
+_OFF_CENTER = 1e-3 * np.array([0.618, 0.382, 0.854])
+
 
 @dataclass(frozen=True)
 class Grid:
@@ -86,6 +88,23 @@ class Grid:
         size = self.cell_size * self.resolution[0] / cells
         nx, ny, nz = (int(np.ceil(n * self.cell_size / size - 1e-6)) for n in self.resolution)
         return Grid(self.minimum, size, (nx, ny, nz))
+
+    def coarser(self) -> Grid:
+        """The same lowest corner with cells of twice the edge; where a count is odd the box grows by a cell of this grid."""
+        nx, ny, nz = (-(-n // 2) for n in self.resolution)
+        return Grid(self.minimum, 2 * self.cell_size, (nx, ny, nz))
+
+    def sight_centers(self, cells: np.ndarray | None = None) -> np.ndarray:
+        """Points by which geometry tells on which side of a wall a cell is [m]: centres, a thousandth of a cell off.
+
+        A scene that is aligned with its grid may have a wall exactly on a plane of centres; these would be on no side of it.
+
+        Args:
+            cells: indices (x, y, z), shape [..., 3]; all cells as [n_z, n_y, n_x, 3] if None.
+        """
+        if cells is None:
+            return self.cell_centers() + self.cell_size * _OFF_CENTER
+        return np.asarray(self.minimum) + self.cell_size * (np.asarray(cells) + 0.5 + _OFF_CENTER)
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """True where a point [n,3] [m] lies in a cell, shape [n]."""

@@ -12,7 +12,9 @@ from typing import Literal, get_args
 import numpy as np
 import torch
 
+from difflpv.blocking import Blocking, blocking_of
 from difflpv.config import LpvConfig
+from difflpv.coordinates import check_points
 from difflpv.direct import (
     Emitters,
     area_light_vpls,
@@ -23,13 +25,15 @@ from difflpv.direct import (
     visibility,
 )
 from difflpv.grid import Grid
-from difflpv.occlusion import Blockers, blocking_potential, geometry_volume
+from difflpv.lookup import CellReads, Lookup, OpenCells, open_cells
+from difflpv.occlusion import Blockers
 from difflpv.raycast import Raycaster
 from difflpv.rsm import Rsm, TexelFlux, render_rsm, rsm_blockers, rsm_vpls
 from difflpv.scene import AreaLight, Scene, SceneError
-from difflpv.stencil import FaceStencil
 from difflpv.surface import SurfaceSamples, sample_surfaces
 from difflpv.vpl import Vpls
+
+_BIAS = 0.5  # cells are picked half a cell off the surface
 
 __all__ = ["Component", "Illumination", "LightValues", "Receivers", "illuminate"]
 
@@ -73,11 +77,15 @@ class Receivers:
         position: [n,3] m.
         normal: unit normals on the free side, [n,3].
         visible: which point, spot and directional light each sees, uint8 [n,m] (component "direct" only).
+        reads: cells that each may read, for each of the configuration's grids; empty where the lookup reads all eight.
+        lookup: what they were picked by.
     """
 
     position: torch.Tensor
     normal: torch.Tensor
     visible: torch.Tensor | None = None
+    reads: tuple[CellReads, ...] = ()
+    lookup: Lookup = "trilinear"
 
     def __len__(self) -> int:
         return len(self.position)
@@ -91,22 +99,24 @@ class Illumination:
         component: "direct" or "bounce1".
         scene: with its lights.
         grid: cells of the volume.
+        config: the solve it was traced for.
         emitters: all lights (area lights as samples of their surface).
         samples: lit surface samples that start the bounce of area lights, or None.
         visible: which emitter each sample sees, uint8.
         rsms: one per point, spot or directional light (component "bounce1").
-        potential: blocking potential [F, n_z, n_y, n_x] of the configuration's stencil, or None.
+        blocking: what stands between the cells of each of the configuration's grids, finest first.
         raycaster: over the scene.
     """
 
     component: Component
     scene: Scene
     grid: Grid
+    config: LpvConfig
     emitters: Emitters
     samples: SurfaceSamples | None
     visible: torch.Tensor | None
     rsms: tuple[Rsm, ...]
-    potential: torch.Tensor | None
+    blocking: tuple[Blocking, ...]
     raycaster: Raycaster
 
     def _punctual(self) -> torch.Tensor:
@@ -120,6 +130,32 @@ class Illumination:
     def _scene_vpls(self) -> Vpls:
         with torch.no_grad():
             return self._shade(LightValues())
+
+    def vpl_cells(self, vpls: Vpls, bias: float) -> OpenCells:
+        """Cells that each VPL may give to, for deposit="visible": traced once for the scene's own lights, anew for moved ones.
+
+        Args:
+            vpls: all of the component.
+            bias: offset along the normal [cells].
+        """
+        own = self._scene_vpls
+        if bias == _BIAS and torch.equal(vpls.position, own.position):
+            return self._scene_vpl_cells
+        return self._open_cells(vpls.position, vpls.normal, "visible", self.grid, bias)
+
+    @cached_property
+    def _scene_vpl_cells(self) -> OpenCells:
+        vpls = self._scene_vpls
+        return self._open_cells(vpls.position, vpls.normal, "visible", self.grid, _BIAS)
+
+    def _open_cells(
+        self, position: torch.Tensor, normal: torch.Tensor, mode: Literal["front", "visible", "affine"], grid: Grid,
+        bias: float,
+    ) -> OpenCells:  # fmt: skip
+        return open_cells(
+            position.detach().cpu().numpy(), normal.detach().cpu().numpy(), grid, mode=mode, raycaster=self.raycaster,
+            bias=bias, dtype=position.dtype, device=position.device,
+        )  # fmt: skip
 
     def _shade(self, values: LightValues) -> Vpls:
         emitters = self.emitters.adjusted(scale=values.scale(), offset=values.position)
@@ -140,14 +176,20 @@ class Illumination:
         return rsm_vpls(rsm, position=position, power=emitters.power[light], albedo=albedo)
 
     def receivers(self, position: np.ndarray | torch.Tensor, normal: np.ndarray | torch.Tensor) -> Receivers:
-        """Receivers [n,3], [n,3], with the shadow rays that the direct part of punctual lights needs."""
+        """Receivers [n,3], [n,3], with the rays that the direct part of punctual lights and the lookup need."""
         like = self.emitters.position
-        x = torch.as_tensor(np.asarray(position), dtype=like.dtype, device=like.device)
-        n = torch.as_tensor(np.asarray(normal), dtype=like.dtype, device=like.device)
+        x, n = (torch.as_tensor(a, dtype=like.dtype, device=like.device).detach() for a in (position, normal))
+        check_points("position", x)
+        check_points("normal", n, count=len(x))
+        seen, reads = None, []
+        if self.config.lookup in ("front", "visible", "affine"):
+            for grid in self.config.grids(self.grid):
+                usable = self._open_cells(x, n, self.config.lookup, grid, _BIAS)
+                reads.append(CellReads(usable.cells, usable.weights(x, n, grid), usable.backed))
         punctual = self._punctual()
-        if self.component != "direct" or not bool(punctual.any()):
-            return Receivers(x, n)
-        return Receivers(x, n, visibility(x, n, self.emitters.select(punctual), self.raycaster))
+        if self.component == "direct" and bool(punctual.any()):
+            seen = visibility(x, n, self.emitters.select(punctual), self.raycaster)
+        return Receivers(x, n, seen, tuple(reads), self.config.lookup or "trilinear")
 
     def punctual_irradiance(self, receivers: Receivers, values: LightValues | None = None) -> torch.Tensor | None:
         """Direct irradiance [n,3] W/m2 of point, spot and directional lights by shadow rays; None where there is none."""
@@ -185,7 +227,8 @@ def illuminate(
         area_samples: samples per area light.
         rsm_resolution: texels along an edge of an RSM face.
         texel_flux: what a texel receives, see ``difflpv.rsm.render_rsm``.
-        blockers: what fills the geometry volume: all surfaces by area, or only what the RSMs see (the publications).
+        blockers: what fills the geometry volume: all surfaces by area, or only what the RSMs see (the publications); a
+            linear stencil's pairs of cells see each of them from both sides.
         seed: of all samples.
         dtype: float32 to run, float64 to check gradients.
         device: where the solve runs.
@@ -216,25 +259,25 @@ def illuminate(
             for light in scene.lights
             if not isinstance(light, AreaLight)
         )
-    potential = None
-    if config.occlusion != "none":
-        if blockers == "rsm" and not rsms:
-            raise ValueError("blockers: 'rsm' needs a point, spot or directional light; use 'surface'")
+
+    def surfels() -> tuple[Blockers, bool]:
         if blockers == "rsm":
             parts = [Blockers(*rsm_blockers(rsm)) for rsm in rsms]
-            surfels = Blockers(*(torch.cat([getattr(p, name) for p in parts]) for name in ("position", "normal", "area")))
-        else:
-            s = sample_surfaces(
-                scene, surface_samples, seed=seed, dtype=dtype, device=device, both_sides=False, include_lights=True
-            )
-            surfels = Blockers(s.position, s.normal, s.area)
-        stencil = config.stencil
-        assert isinstance(stencil, FaceStencil)  # LpvConfig refuses occlusion with a linear one
-        corners = geometry_volume(surfels, grid, l_max=stencil.l_max, two_sided=blockers == "surface")
-        potential = blocking_potential(corners, stencil.offsets, stencil.directions)
+            if not parts:
+                raise ValueError("blockers: 'rsm' needs a point, spot or directional light; use 'surface'")
+            joined = (torch.cat([getattr(p, name) for p in parts]) for name in ("position", "normal", "area"))
+            return Blockers(*joined), False
+        s = sample_surfaces(
+            scene, surface_samples, seed=seed, dtype=dtype, device=device, both_sides=False, include_lights=True
+        )
+        return Blockers(s.position, s.normal, s.area), True
+
+    blocking = tuple(
+        blocking_of(scene, level, config, raycaster, surfels, dtype=dtype, device=device) for level in config.grids(grid)
+    )
     if component == "direct":
         rsms = ()
-    return Illumination(component, scene, grid, emitters, samples, visible, rsms, potential, raycaster)
+    return Illumination(component, scene, grid, config, emitters, samples, visible, rsms, blocking, raycaster)
 
 
 def _check_extent(scene: Scene) -> None:

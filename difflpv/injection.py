@@ -9,20 +9,22 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 
 from difflpv.bridge import check_float, launch, refuse_forward_mode, refuse_second_derivative, warp_scalar
 from difflpv.coordinates import cell_coordinates, check_factor, check_finite, shifted_points
 from difflpv.grid import Grid
-from difflpv.sh import coeff_count
+from difflpv.lookup import OpenCells
+from difflpv.sh import coeff_count, cosine_lobe
 from difflpv.vpl import Vpls
+from difflpv.weighted import spread_lobes
 from warp_kernels.injection import injection_kernels
 
 __all__ = ["Deposit", "InjectionReport", "deposit_lobes", "inject"]
 
-Deposit = Literal["nearest", "trilinear"]
+Deposit = Literal["nearest", "trilinear", "visible"]
 
 
 @dataclass(frozen=True)
@@ -97,7 +99,7 @@ def deposit_lobes(
     shape: tuple[int, int, int],
     *,
     l_max: int,
-    deposit: Deposit,
+    deposit: Literal["nearest", "trilinear"],
 ) -> torch.Tensor:
     """Add ``amplitude * cosine_lobe(normal)`` to the cells of a lattice.
 
@@ -117,7 +119,13 @@ def deposit_lobes(
 
 
 def inject(
-    vpls: Vpls, grid: Grid, *, l_max: int, deposit: Deposit = "nearest", bias: float | torch.Tensor = 0.5
+    vpls: Vpls,
+    grid: Grid,
+    *,
+    l_max: int,
+    deposit: Deposit = "nearest",
+    bias: float | torch.Tensor = 0.5,
+    open_cells: OpenCells | None = None,
 ) -> tuple[torch.Tensor, InjectionReport]:
     """Inject VPLs: add ``(flux/pi) cosine_lobe(normal)`` to the cell that holds ``position + bias h normal``.
 
@@ -125,11 +133,12 @@ def inject(
         vpls: positions [m], unit normals, flux [W]; no VPL at all gives a volume of zeros.
         grid: the volume's cells, h = ``grid.cell_size``.
         l_max: highest SH degree, 0..3.
-        deposit: ``"nearest"`` cell (the publications), or ``"trilinear"`` over the eight cells around the point.
-            Only the latter has a gradient for ``position`` and ``bias``; with ``"nearest"`` theirs is None. Within
-            half a cell of the grid's faces the weights fold onto the edge cells, so a VPL inside the grid never
-            loses flux.
+        deposit: ``"nearest"`` cell (the publications), ``"trilinear"`` over the eight cells around the point, or
+            ``"visible"`` over those that ``open_cells`` allows. Only ``"nearest"`` has no gradient for ``position`` and
+            ``bias``: theirs is None. Within half a cell of the grid's faces the weights fold onto the edge cells, so a
+            VPL inside the grid never loses flux.
         bias: offset along the normal, in cells; a number or a tensor of one element.
+        open_cells: cells that each VPL may give to, for ``"visible"``.
 
     Returns:
         Intensity [W/sr], shape [3, (l_max+1)^2, n_z, n_y, n_x], and the report of VPLs outside the grid. Gradients
@@ -144,20 +153,32 @@ def inject(
         raise TypeError(f"vpls: expected difflpv.vpl.Vpls, got {type(vpls).__name__}")
     if not isinstance(grid, Grid):
         raise TypeError(f"grid: expected difflpv.grid.Grid, got {type(grid).__name__}")
-    if deposit not in ("nearest", "trilinear"):
-        raise ValueError(f"deposit: expected 'nearest' or 'trilinear', got {deposit!r}")
+    if deposit not in get_args(Deposit):
+        raise ValueError(f"deposit: expected one of {', '.join(get_args(Deposit))}, got {deposit!r}")
+    if (deposit == "visible") != (open_cells is not None):
+        raise ValueError("open_cells: expected with deposit='visible' and with no other")
     coeff_count(l_max)
     check_float("vpls.position", vpls.position)
     for name in ("position", "normal", "flux"):
         check_finite(f"vpls.{name}", getattr(vpls, name))
     check_factor("bias", bias, like=vpls.position)
     cells = cell_coordinates(shifted_points(vpls.position, vpls.normal, grid, bias), grid)
-    volume = deposit_lobes(cells, vpls.normal, vpls.flux / math.pi, grid.shape, l_max=l_max, deposit=deposit)
+    if deposit != "visible":
+        volume = deposit_lobes(cells, vpls.normal, vpls.flux / math.pi, grid.shape, l_max=l_max, deposit=deposit)
+    else:
+        assert open_cells is not None  # checked above
+        weights = open_cells.weights(vpls.position, vpls.normal, grid, bias=bias) * _inside(cells, grid)[:, None]
+        lobes = cosine_lobe(vpls.normal, l_max)
+        volume = spread_lobes(vpls.flux / math.pi, open_cells.cells, weights, lobes, grid.shape)
     return volume, _report(cells.detach(), vpls.flux.detach(), grid)
 
 
+def _inside(cells: torch.Tensor, grid: Grid) -> torch.Tensor:
+    return ((cells >= 0) & (cells < cells.new_tensor(grid.resolution))).all(1)
+
+
 def _report(cells: torch.Tensor, flux: torch.Tensor, grid: Grid) -> InjectionReport:
-    inside = ((cells >= 0) & (cells < cells.new_tensor(grid.resolution))).all(1)
+    inside = _inside(cells, grid)
     total = flux.sum()
     lost = (flux.sum(1) * ~inside).sum()
     share = torch.where(

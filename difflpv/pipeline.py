@@ -8,17 +8,23 @@ from typing import Any
 
 import torch
 
+from difflpv.attenuation import attenuate_pairs
+from difflpv.blocking import Blocking
 from difflpv.config import LpvConfig
+from difflpv.damping import damped_irradiance
 from difflpv.fitted import FittedError, FittedRecord, read_fitted, write_fitted
 from difflpv.grid import Grid
 from difflpv.illumination import Illumination, LightValues, Receivers
 from difflpv.injection import InjectionReport, inject
 from difflpv.learnables import describe_learnables, fixed_values
-from difflpv.occlusion import attenuate
 from difflpv.parameters import Parameter
 from difflpv.propagation import propagate
 from difflpv.sampling import sample_irradiance
 from difflpv.scene import Scene
+from difflpv.sh import cosine_lobe
+from difflpv.stencil import LinearStencil, pair_offsets
+from difflpv.stencil_coordinates import StencilCoordinates
+from difflpv.weighted import gather_lobes
 
 __all__ = ["Lpv"]
 
@@ -69,6 +75,10 @@ class Lpv(torch.nn.Module):
         self.checkpoint_every = checkpoint_every
         self.described: tuple[Parameter, ...] = tuple(describe_learnables(learn, self.config, grid, scene, initial))
         self._fixed = fixed_values(self.config)
+        stencil = self.config.stencil
+        self._coordinates = None
+        if "stencil" in learn and isinstance(stencil, LinearStencil):
+            self._coordinates = StencilCoordinates.for_stencil(stencil)
         for parameter in self.described:
             raw = torch.nn.Parameter(parameter.to_raw(parameter.initial))
             self.register_parameter(f"raw_{parameter.name}", raw)
@@ -137,9 +147,7 @@ class Lpv(torch.nn.Module):
             FloatingPointError: the result is not finite.
         """
         v = self._complete(values, receivers.position)
-        irradiance = sample_irradiance(
-            self.accumulate(illumination, values), receivers.position, receivers.normal, self.grid, bias=v["sampling_bias"]
-        )
+        irradiance = self.read(self.accumulate(illumination, values), receivers, values)
         direct = illumination.punctual_irradiance(receivers, _light_values(v))
         if direct is not None:
             irradiance = irradiance + direct
@@ -147,33 +155,101 @@ class Lpv(torch.nn.Module):
             raise FloatingPointError(self._not_finite({name: value.detach() for name, value in v.items()}))
         return irradiance
 
-    def accumulate(self, illumination: Illumination, values: Mapping[str, torch.Tensor] | None = None) -> torch.Tensor:
-        """The solved volume [3, K, n_z, n_y, n_x] W/sr: shade, inject, occlude, propagate."""
+    def accumulate(
+        self, illumination: Illumination, values: Mapping[str, torch.Tensor] | None = None
+    ) -> tuple[torch.Tensor, ...]:
+        """The solved volume [3, K, n_z, n_y, n_x] W/sr of each grid, finest first: shade, inject, occlude, propagate."""
         if illumination.grid != self.grid:
             raise ValueError(f"illumination: expected one made for {self.grid}, got {illumination.grid}")
         config = self.config
-        if config.occlusion != "none" and illumination.potential is None:
-            raise ValueError(f"illumination: made without occlusion, this solve needs '{config.occlusion}'")
         v = self._complete(values, illumination.emitters.position)
         stencil = config.stencil
-        vpls = illumination.vpls(_light_values(v))
+        vpls, bias = illumination.vpls(_light_values(v)), v["injection_bias"]
+        cells = illumination.vpl_cells(vpls, float(bias.detach())) if config.deposit == "visible" else None
         volume, self.report = inject(
-            vpls, self.grid, l_max=stencil.l_max, deposit=config.deposit, bias=v["injection_bias"]
+            vpls, self.grid, l_max=stencil.l_max, deposit=config.deposit or "nearest", bias=bias, open_cells=cells
         )
-        passed = None
-        if config.occlusion != "none" and illumination.potential is not None:
-            passed = attenuate(illumination.potential, model=config.occlusion, strength=v["occlusion"])
-        return propagate(
-            volume,
-            stencil,
-            steps=config.steps,
-            factor=v["propagation"] * v["propagation_steps"],
-            transmittance=passed,
-            occlude_first_step=config.occlude_first_step,
-            clamp=config.clamp,
-            tolerance=config.tolerance,
-            checkpoint_every=self.checkpoint_every,
+        matrices = None
+        if self._coordinates is not None:
+            z = (values or {}).get("stencil", self.values()["stencil"])  # as it is: not in the precision of the light
+            matrices = self._coordinates.matrices(z.cpu().double()).to(volume)
+        factors, first = v["propagation"] * v["propagation_steps"], config.fine_steps
+
+        def moved(light: torch.Tensor, level: int, begin: int, end: int) -> torch.Tensor:
+            return propagate(
+                light,
+                stencil,
+                steps=end - begin,
+                factor=factors[begin:end],
+                transmittance=self._transmittance(illumination, level, v),
+                # without blockers only a field of the cells acts there, which is no self-shadowing
+                occlude_first_step=bool(config.occlude_first_step) or begin > 0 or config.occlusion == "none",
+                clamp=config.clamp,
+                matrices=matrices,
+                tolerance=config.tolerance,
+                checkpoint_every=self.checkpoint_every,
+            )
+
+        solved = moved(volume, 0, 0, first)
+        if first == config.steps:
+            return (solved,)
+        # what a step adds is what still moves: it is read where it goes on, in the coarse cells
+        before = moved(volume, 0, 0, first - 1)
+        return before, moved(coarsen(solved - before), 1, first, config.steps)
+
+    def _transmittance(
+        self, illumination: Illumination, level: int, v: Mapping[str, torch.Tensor]
+    ) -> torch.Tensor | None:
+        """What passes between cells, per pair of a linear stencil or face of a face stencil; None where nothing blocks."""
+        config, stencil = self.config, self.config.stencil
+        offsets = pair_offsets(stencil.offsets) if isinstance(stencil, LinearStencil) else stencil.offsets
+        traced = config.occlusion == "traced"
+        blocking = illumination.blocking[level] if level < len(illumination.blocking) else Blocking()
+        blockers = blocking.passed if traced else blocking.potential
+        if config.occlusion == "none":
+            blockers = None
+        elif blockers is None or len(blockers) != len(offsets):
+            made = illumination.config
+            raise ValueError(
+                f"illumination: made for '{made.method}' with occlusion '{made.occlusion}' on {len(illumination.blocking)} "
+                f"grid(s), this solve needs '{config.method}' with '{config.occlusion}' on {level + 1} or more"
+            )
+        return attenuate_pairs(
+            offsets,
+            potential=None if traced else blockers,
+            passed=blockers if traced else None,
+            model="exp" if config.occlusion == "exp" else "clamp",
+            strength=v["occlusion"],
+            correction=v.get("occlusion_correction"),
+            cell_occlusion=v.get("cell_occlusion"),
+            cell_propagation=v.get("cell_propagation"),
         )
+
+    def read(
+        self, volumes: Sequence[torch.Tensor], receivers: Receivers, values: Mapping[str, torch.Tensor] | None = None
+    ) -> torch.Tensor:
+        """Irradiance [n,3] W/m2 of receivers from the volumes that ``accumulate`` returns."""
+        v = self._complete(values, receivers.position)
+        degrees = torch.arange(self.config.stencil.l_max + 1, device=receivers.position.device)
+        gains = v["lookup_gains"].repeat_interleave(2 * degrees + 1)
+        x, n, grids = receivers.position, receivers.normal, self.config.grids(self.grid)
+        if self.config.lookup in ("trilinear", "damped"):
+            sample = sample_irradiance if self.config.lookup == "trilinear" else damped_irradiance
+            parts = [
+                sample(volume * gains[:, None, None, None], x, n, grid, bias=v["sampling_bias"])
+                for volume, grid in zip(volumes, grids, strict=True)
+            ]
+            return torch.stack(parts).sum(0)
+        if receivers.lookup != self.config.lookup or len(receivers.reads) < len(grids):
+            raise ValueError(
+                f"receivers: made for lookup '{receivers.lookup}' on {len(receivers.reads)} grid(s), this solve needs "
+                f"'{self.config.lookup}' on {len(grids)}"
+            )
+        lobe, parts = cosine_lobe(-n, self.config.stencil.l_max), []
+        for volume, grid, r in zip(volumes, grids, receivers.reads[: len(grids)], strict=True):
+            lobes = lobe * (1 + (gains - 1) * r.backed[:, None])
+            parts.append(gather_lobes(volume, r.cells, r.weights, lobes) / grid.cell_size**2)
+        return torch.stack(parts).sum(0)
 
     def _complete(self, values: Mapping[str, torch.Tensor] | None, like: torch.Tensor) -> dict[str, torch.Tensor]:
         merged = {**self._fixed, **self.values(), **(values or {})}
@@ -189,6 +265,13 @@ class Lpv(torch.nn.Module):
         return "irradiance is not finite: check the values " + ", ".join(
             f"{name} = {float(value.max()):.4g}" for name, value in values.items() if value.numel()
         )
+
+
+def coarsen(volume: torch.Tensor) -> torch.Tensor:
+    """Intensity in cells of twice the edge: sums of 2 x 2 x 2 cells, shape [C, K, ceil(n_z/2), ceil(n_y/2), ceil(n_x/2)]."""
+    z, y, x = volume.shape[2:]
+    even = torch.nn.functional.pad(volume, (0, x % 2, 0, y % 2, 0, z % 2))
+    return even.unflatten(4, (-1, 2)).unflatten(3, (-1, 2)).unflatten(2, (-1, 2)).sum((3, 5, 7))
 
 
 def _light_values(values: Mapping[str, torch.Tensor]) -> LightValues:

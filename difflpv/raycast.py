@@ -54,14 +54,16 @@ class Raycaster:
         distance = np.where(triangle >= 0, np.asarray(result["tfar"], np.float64), np.inf)
         return Hits(triangle, distance, np.stack([result["u"], result["v"]], -1).astype(np.float64))
 
-    def blocked(self, origins: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    def blocked(self, origins: np.ndarray, targets: np.ndarray, *, shortened: bool = True) -> np.ndarray:
         """True where the open segment from ``origins`` to ``targets`` [n,3] m meets a triangle.
 
-        The segment is shortened by ``offset`` at its far end; start ``origins`` off their surface.
+        The segment is shortened by twice ``offset`` at its far end, unless the targets lie on no surface; start ``origins``
+        off their surface.
         """
         delta = np.asarray(targets, np.float64) - origins
         length = np.linalg.norm(delta, axis=1)
-        return self.blocked_along(origins, delta / np.maximum(length, 1e-30)[:, None], length - 2 * self.offset)
+        limit = length - 2 * self.offset if shortened else length
+        return self.blocked_along(origins, delta / np.maximum(length, 1e-30)[:, None], limit)
 
     def blocked_along(self, origins: np.ndarray, directions: np.ndarray, distance: np.ndarray | float) -> np.ndarray:
         """True where a ray meets a triangle within ``distance`` [n] or scalar, m; ``np.inf`` for a parallel light."""

@@ -44,6 +44,8 @@ class LinearStencil:
         name: short name for tables and files.
         offsets: destination minus source cell (x, y, z), shape [n,3] int.
         matrices: shape [n, K, K] float64.
+        lookup_gains: factor per degree l with which receivers read the volume, [l_max+1]; trained with the matrices, 1 where
+            nothing was.
         pair_count: number P of pairs of cells that it connects, see ``pair_offsets``.
         one_way: offsets whose opposite it lacks; occlusion needs both.
     """
@@ -51,6 +53,7 @@ class LinearStencil:
     name: str
     offsets: np.ndarray
     matrices: np.ndarray
+    lookup_gains: tuple[float, ...] = ()
     pair_count: int = field(init=False)
     one_way: tuple[tuple[int, ...], ...] = field(init=False)
 
@@ -64,7 +67,11 @@ class LinearStencil:
             raise ValueError(f"matrices: expected shape [{len(offsets)}, K, K], got {list(matrices.shape)}")
         if not np.isfinite(matrices).all():
             raise ValueError("matrices: expected finite numbers, got NaN or infinity")
-        degree_of_count(matrices.shape[1])
+        l_max = degree_of_count(matrices.shape[1])
+        gains = tuple(float(v) for v in self.lookup_gains) or (1.0,) * (l_max + 1)
+        if len(gains) != l_max + 1 or not np.isfinite(gains).all():
+            raise ValueError(f"lookup_gains: expected {l_max + 1} finite numbers, got {list(gains)}")
+        object.__setattr__(self, "lookup_gains", gains)
         cells = [tuple(n) for n in offsets.tolist()]
         # plain numbers, here and not where they are used, so that torch.compile can trace what uses them
         object.__setattr__(self, "pair_count", len(pair_offsets(offsets)))
@@ -127,6 +134,11 @@ class FaceStencil:
             paired = rows.shape == (len(self.offsets), 3) and len(rows) % 2 == 0 and np.allclose(rows[0::2], -rows[1::2])
             if not paired:
                 raise ValueError(f"{name}: expected shape [F, 3] in antipodal pairs, got shape {list(rows.shape)}")
+
+    @property
+    def lookup_gains(self) -> tuple[float, ...]:
+        """Receivers read every degree as it is, [l_max+1]."""
+        return (1.0,) * (self.l_max + 1)
 
     @cached_property
     def flux_weights(self) -> np.ndarray:

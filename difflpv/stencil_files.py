@@ -1,4 +1,7 @@
-"""Linear stencils on disk: ``<name>.safetensors`` with ``offsets`` [n,3] and ``matrices`` [n,K,K]; the shipped ones by name."""
+"""Linear stencils on disk, and the shipped ones by name.
+
+``<name>.safetensors`` holds ``offsets`` [n,3], ``matrices`` [n,K,K] and, optionally, ``lookup_gains`` [l_max+1].
+"""
 
 from __future__ import annotations
 
@@ -25,10 +28,11 @@ class StencilError(ValueError):
 
 
 def save_stencil(path: str | Path, stencil: LinearStencil) -> None:
-    """Write ``offsets`` [n,3] int32 and ``matrices`` [n,K,K] float64, destination from source coefficients, atomically."""
+    """Write ``offsets`` int32, ``matrices`` (destination from source coefficients) and ``lookup_gains`` float64, atomically."""
     tensors: dict[str, np.ndarray] = {
         "offsets": np.ascontiguousarray(stencil.offsets, dtype=np.int32),
         "matrices": np.ascontiguousarray(stencil.matrices, dtype=np.float64),
+        "lookup_gains": np.array(stencil.lookup_gains, dtype=np.float64),
     }
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     with atomic_path(path) as target:
@@ -60,7 +64,8 @@ def _read(path: Path) -> LinearStencil:
         raise StencilError(f"{path}: expected tensors 'offsets' and 'matrices', missing {', '.join(sorted(missing))}")
     try:
         offsets = tensors["offsets"].astype(np.int64)
-        return LinearStencil(path.stem, offsets, tensors["matrices"].astype(np.float64))
+        gains = tuple(tensors.get("lookup_gains", np.empty(0)).tolist())
+        return LinearStencil(path.stem, offsets, tensors["matrices"].astype(np.float64), gains)
     except (TypeError, ValueError) as error:
         raise StencilError(f"{path}: {' '.join(str(error).split())}") from None
 

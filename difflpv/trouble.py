@@ -100,12 +100,13 @@ def _growth(lpv: Lpv, values: Mapping[str, torch.Tensor] | None) -> str:
 
 def _reach(lpv: Lpv, light: Illumination) -> str:
     """Light moves at most one cell per step along each axis."""
-    cells = _span(lpv, light)
-    if lpv.config.steps >= cells - 1 or lpv.config.tolerance > 0:
+    cells, config = _span(lpv, light), lpv.config
+    reach = 2 * config.steps - config.fine_steps
+    if reach >= cells - 1 or config.tolerance > 0:
         return ""
     return (
-        f"{lpv.config.steps} steps carry light {lpv.config.steps} cells at most, the scene spans {cells}: what lies farther "
-        f"from the light stays dark; take at least {cells - 1} steps or larger cells"
+        f"{config.steps} steps carry light {reach} cells at most, the scene spans {cells}: what lies farther "
+        f"from the light stays dark; take at least {config.steps + cells - 1 - reach} steps, larger cells or coarsen_after"
     )
 
 
@@ -118,11 +119,11 @@ def _span(lpv: Lpv, light: Illumination) -> int:
 
 def _untrained(lpv: Lpv, light: Illumination) -> str:
     cells = _span(lpv, light)
-    if not lpv.config.method.startswith("learned") or cells <= _TRAINED:
+    if not lpv.config.method.startswith("learned") or cells <= _TRAINED * (1 if len(lpv.config.grids(lpv.grid)) == 1 else 2):
         return ""
     return (
         f"the scene spans {cells} cells, '{lpv.config.method}' was trained to {_TRAINED // 2} and holds to about {_TRAINED}: "
-        "far light is wrong; take larger cells"
+        "far light is wrong; take larger cells, or two cell sizes (coarsen_after)"
     )
 
 
@@ -158,10 +159,11 @@ def _cells(lpv: Lpv, light: Illumination, position: np.ndarray, normal: np.ndarr
             f"cells of {size:.4g} m are too large for the rooms: {100 * narrow:.0f} % of the receivers have less than "
             f"{_NARROW_CELLS:g} cells of free space in front of them (median {np.median(front):.3g} m); take more cells"
         )
-    if thin > _THIN_SHARE:
+    closed = lpv.config.occlusion == "traced" and lpv.config.lookup in ("front", "visible", "affine")
+    if thin > _THIN_SHARE and not closed:
         lines.append(
             f"walls are thinner than a cell of {size:.4g} m: {100 * thin:.0f} % of the receivers lie on less than a cell of "
-            f"matter (thinnest {behind.min():.2g} m), and light leaks through it; take smaller cells"
+            f"matter (thinnest {behind.min():.2g} m), and light leaks through it; take smaller cells or occlusion 'traced'"
         )
     return lines
 

@@ -8,6 +8,8 @@ from cli_room import difflpv, make_targets, write_room
 
 import difflpv.cli.fit as fit_command
 from data_gen.load import load_targets
+from difflpv.cli.held_out import overfitting
+from difflpv.evaluate import Score
 from difflpv.fitted import read_fitted
 from difflpv.io import load_scene
 from difflpv.pipeline import Lpv
@@ -63,7 +65,7 @@ def test_fit_then_evaluate_agree(room, tmp_path, capsys):
 def test_text_says_what_was_chosen_and_shows_both_splits(room, tmp_path, capsys):
     assert difflpv(*fit_of(room, tmp_path / "f", "--learn", "injection_bias", "--method", "lpv", "--train-lights", "1-2")) == 0
     out, err = capsys.readouterr()
-    assert err == "" and "deposit trilinear" in out and "occlusion none" in out
+    assert err == "" and "deposit trilinear" in out and "occlusion none" in out and "lookup trilinear" in out
     assert "learn injection_bias by lbfgs on lights 1, 2, judged on 0, 3" in out
     train, test = out.partition("test lights 0, 3")[::2]
     for part in (train.partition("train lights 1, 2")[2], test):
@@ -150,10 +152,47 @@ def test_a_fit_that_overflows_is_code_1(room, tmp_path, capsys):
     assert (tmp_path / "f" / "fitted.json").exists()
 
 
+@pytest.mark.slow
+def test_a_stencil_fit_is_judged_on_a_scene_it_never_saw(room, tmp_path, capsys):
+    """The same room serves as the other scene: what was carried there must do what it does at home."""
+    arguments = ["--method", "learned_4x6", "--learn", "stencil,lookup_gains"]
+    other = f"{room / 'room.glb'}={room / 'targets'}"
+    report, _ = run_json(capsys, *fit_of(room, tmp_path / "f", *arguments, "--unseen", other))
+    (scores,) = report["unseen"].values()
+    assert [s["method"] for s in scores] == ["constant", "learned_4x6 untuned", "learned_4x6 fitted"]
+    here = [s["relative_l2"] for s in report["scores"] if s["method"] == "learned_4x6 fitted"]
+    assert scores[2]["relative_l2"] == pytest.approx(np.mean(here), rel=1e-4)
+    assert len(report["values"]["stencil"]) == 6
+    assert difflpv(*fit_of(room, tmp_path / "f", *arguments, "--unseen", other)) == 0
+    assert "never seen" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_a_field_of_cells_stays_at_one_where_sparsity_says_so(room, tmp_path, capsys):
+    moved = {}
+    for weight in ("1e-6", "100"):
+        arguments = ["--method", "learned_4x6", "--learn", "cell_propagation", "--sparsity", weight]
+        report, _ = run_json(capsys, *fit_of(room, tmp_path / weight, *arguments))
+        moved[weight] = np.abs(np.log(report["values"]["cell_propagation"])).mean()
+    assert moved["100"] < 0.2 * moved["1e-6"]
+
+
+def score_of(method, error):
+    return Score(method, "bounce1", -1, error, error, 1.0, error, error)
+
+
+def test_overfitting_is_said_where_only_train_lights_gain():
+    train = [score_of("a untuned", 0.4), score_of("a fitted", 0.2)]
+    assert overfitting(train, [score_of("a untuned", 0.4), score_of("a fitted", 0.25)]) == []
+    (line,) = overfitting(train, [score_of("a untuned", 0.4), score_of("a fitted", 0.42)])
+    assert line.startswith("overfitting: error fell by 50 % on train lights, by -5 % on test lights")
+    assert overfitting([score_of("a untuned", 0.4), score_of("a fitted", 0.4)], train) == []
+
+
 BAD = {
     "name": (["--learn", "gain"], "learn: expected names from propagation, propagation_steps"),
     "twice": (["--learn", "occlusion,occlusion"], "learn: 'occlusion' is named twice"),
-    "none": (["--learn", "occlusion", "--occlusion", "none"], "learn: 'occlusion' needs occlusion='clamp' or 'exp'"),
+    "none": (["--learn", "occlusion", "--occlusion", "none"], "learn: 'occlusion' needs occlusion='clamp', 'exp' or 'traced'"),
     "nearest": (["--learn", "injection_bias", "--deposit", "nearest"], "learn: 'injection_bias' needs deposit='trilinear'"),
     "albedo": (["--learn", "albedo", "--component", "direct"], "learn: 'albedo' has no part in component 'direct'"),
     "lights": (["--learn", "light_color"], "--learn: light_color belong to one light: name it with --train-lights K"),
@@ -165,6 +204,10 @@ BAD = {
     "budget": (["--budget", "1"], "budget: expected at least 3 forward-equivalents for lbfgs, got 1.0"),
     "solver": (["--solver", "newton"], "argument --solver: invalid choice: 'newton'"),
     "lr": (["--lr", "0.1"], "--lr: belongs to --solver adam, got --solver lbfgs"),
+    "sparsity": (["--sparsity", "0.1"], "--sparsity: belongs to --learn cell_propagation or cell_occlusion"),
+    "unseen": (["--unseen", "cornell"], "as two_rooms_90=out/targets, got 'cornell'"),
+    "unseen folder": (["--unseen", "cornell=/nowhere"], "/nowhere"),
+    "unseen field": (["--learn", "albedo", "--unseen", "cornell=x"], "--unseen: albedo can not be carried"),
     "constant": (["--method", "constant"], "argument --method: invalid choice: 'constant'"),
     "component": (["--component", "full"], "argument --component: invalid choice: 'full'"),
     "nnls": (["--solver", "nnls", "--budget", "3"], "budget: expected at least 4 forward-equivalents for nnls"),

@@ -20,10 +20,10 @@ def test_defaults_are_the_publications():
     ("options", "message"),
     [
         ({"method": "LPV"}, r"method: expected one of lpv, holpv.*, got 'LPV'"),
-        ({"occlusion": "soft"}, "occlusion: expected one of none, clamp, exp, got 'soft'"),
+        ({"occlusion": "soft"}, "occlusion: expected one of none, clamp, exp, traced, got 'soft'"),
         ({"normalization": "flux"}, "normalization: expected one of energy, thesis, got 'flux'"),
         ({"reprojection": "lobe"}, "reprojection: expected one of face, ray, got 'lobe'"),
-        ({"deposit": "cubic"}, "deposit: expected one of nearest, trilinear, got 'cubic'"),
+        ({"deposit": "cubic"}, "deposit: expected one of nearest, trilinear, visible, got 'cubic'"),
         ({"steps": -1}, "steps: expected a number >= 0, got -1"),
         ({"tolerance": -0.1}, "tolerance: expected a number >= 0, got -0.1"),
         ({"tolerance": float("nan")}, "tolerance: expected a number >= 0, got nan"),

@@ -114,16 +114,16 @@ def test_same_seed_same_bits():
 def test_blockers_from_the_maps_or_from_all_surfaces():
     config = LpvConfig(steps=2, occlusion="exp")
     scene = box_scene()
-    walls = lit(scene, "bounce1", config).potential
-    maps = lit(scene, "bounce1", config, blockers="rsm").potential
+    walls = lit(scene, "bounce1", config).blocking[0].potential
+    maps = lit(scene, "bounce1", config, blockers="rsm").blocking[0].potential
     assert walls.shape == maps.shape and maps.any()
     # the light sees all of the box, so both hold the same area; the maps' surfels have one side only
     degree0 = [p.sum().item() for p in (walls, maps)]
     assert 0.3 < degree0[1] / degree0[0] < 0.7
     direct = lit(scene, "direct", config, blockers="rsm")
-    torch.testing.assert_close(direct.potential, maps)
+    torch.testing.assert_close(direct.blocking[0].potential, maps)
     assert not direct.rsms
-    assert lit(scene, "bounce1").potential is None
+    assert lit(scene, "bounce1").blocking[0].potential is None
 
 
 @pytest.mark.parametrize(

@@ -209,7 +209,7 @@ V = random_vpls(torch.Generator().manual_seed(0), torch.float32, count=3)
         (lambda: inject(None, GRID, l_max=1), TypeError, "vpls: expected difflpv.vpl.Vpls, got NoneType"),
         (lambda: inject(V, 32, l_max=1), TypeError, "grid: expected difflpv.grid.Grid, got int"),
         (lambda: inject(V, GRID, l_max=4), ValueError, r"l_max: expected an integer in 0\.\.3, got 4"),
-        (lambda: inject(V, GRID, l_max=1, deposit="cubic"), ValueError, "deposit: expected 'nearest' .* got 'cubic'"),
+        (lambda: inject(V, GRID, l_max=1, deposit="cubic"), ValueError, "deposit: expected one of .*visible, got 'cubic'"),
         (lambda: inject(V, GRID, l_max=1, bias="half"), TypeError, "bias: expected a number or .*Tensor, got str"),
         (lambda: inject(V, GRID, l_max=1, bias=math.nan), ValueError, "bias: expected a finite number, got nan"),
         (

@@ -42,11 +42,14 @@ LAYERS: tuple[tuple[str, tuple[str, ...]], ...] = (
     (
         "stages",
         (
+            "difflpv.attenuation",
             "difflpv.convolution",
+            "difflpv.damping",
             "difflpv.direct",
             "difflpv.face_propagation",
             "difflpv.injection",
             "difflpv.linear_propagation",
+            "difflpv.lookup",
             "difflpv.loss",
             "difflpv.occlusion",
             "difflpv.padded",
@@ -56,18 +59,38 @@ LAYERS: tuple[tuple[str, tuple[str, ...]], ...] = (
             "difflpv.sampling",
             "difflpv.stability",
             "difflpv.stencil",
+            "difflpv.stencil_coordinates",
             "difflpv.stencil_files",
             "difflpv.surface",
             "difflpv.symmetry",
+            "difflpv.traced",
+            "difflpv.weighted",
         ),
     ),
     (
         "pipeline",
-        ("difflpv.config", "difflpv.fitted", "difflpv.illumination", "difflpv.learnables", "difflpv.pipeline"),
+        (
+            "difflpv.blocking",
+            "difflpv.config",
+            "difflpv.fitted",
+            "difflpv.illumination",
+            "difflpv.learnables",
+            "difflpv.pipeline",
+        ),
     ),
     ("optim", ("difflpv.optim",)),
     ("data_gen", ("data_gen",)),
-    ("jobs", ("difflpv.evaluate", "difflpv.fit", "difflpv.simulate", "difflpv.training", "difflpv.trouble")),
+    (
+        "jobs",
+        (
+            "difflpv.evaluate",
+            "difflpv.fit",
+            "difflpv.leakage",
+            "difflpv.simulate",
+            "difflpv.training",
+            "difflpv.trouble",
+        ),
+    ),
     ("report", ("difflpv.report",)),
     ("demo", ("difflpv.demo", "difflpv.stress")),
     ("cli", ("difflpv.cli",)),
@@ -121,7 +144,7 @@ ONLY = (
 )
 
 # Only these parts may know the path tracer: what they judge must not.
-DATA_GEN_USERS = ("data_gen", "difflpv.cli", "difflpv.demo", "difflpv.stress", "scripts")
+DATA_GEN_USERS = ("data_gen", "difflpv.cli", "difflpv.demo", "difflpv.stress", "difflpv.training", "scripts")
 
 LIBRARY_OWNERS: dict[str, tuple[str, ...]] = {
     "warp": ("warp_kernels", "difflpv.bridge", "difflpv.face_propagation"),

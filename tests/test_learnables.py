@@ -9,7 +9,7 @@ from difflpv.learnables import GLOBAL_LEARNABLES, LEARNABLES, describe_learnable
 from difflpv.parameters import Parameter
 
 GRID = Grid((0.0, 0, 0), 0.25, (4, 4, 4))
-FULL = LpvConfig(steps=3, occlusion="exp", deposit="trilinear")
+FULL = LpvConfig(method="learned_4x6", steps=3, deposit="trilinear", lookup="trilinear")
 
 
 @pytest.mark.parametrize(
@@ -17,9 +17,13 @@ FULL = LpvConfig(steps=3, occlusion="exp", deposit="trilinear")
     [
         (["gain"], {}, "learn: expected names from propagation, .*albedo, got 'gain'"),
         (["propagation", "propagation"], {}, "learn: 'propagation' is named twice"),
-        (["occlusion"], {}, "learn: 'occlusion' needs occlusion='clamp' or 'exp', got 'none'"),
-        (["injection_bias"], {}, "learn: 'injection_bias' needs deposit='trilinear', got 'nearest'"),
+        (["occlusion"], {}, "learn: 'occlusion' needs occlusion='clamp', 'exp' or 'traced', got 'none'"),
+        (["injection_bias"], {}, "learn: 'injection_bias' needs deposit='trilinear' or 'visible', got 'nearest'"),
         (["light_position"], {}, "learn: 'light_position' needs deposit='trilinear'"),
+        (["cell_occlusion"], {}, "learn: 'cell_occlusion' needs occlusion='clamp', 'exp' or 'traced', got 'none'"),
+        (["occlusion_correction"], {"occlusion": "exp"}, "learn: 'occlusion_correction' needs occlusion='traced', got 'exp'"),
+        (["sampling_bias"], {"lookup": "front"}, "learn: 'sampling_bias' needs lookup='trilinear' or 'damped', got 'front'"),
+        (["stencil"], {}, "learn: 'stencil' needs a learned stencil, got method 'holpv'"),
         (["propagation_steps"], {"steps": 0}, "learn: 'propagation_steps' needs at least one step"),
         (["albedo"], {}, "learn: 'albedo' belongs to a scene: pass scene="),
     ],
@@ -44,9 +48,10 @@ def test_shapes_and_starts_of_everything():
     assert tuple(described) == LEARNABLES
     shapes = {name: list(p.shape) for name, p in described.items()}
     assert shapes["propagation_steps"] == [3] and shapes["light_position"] == [1, 3] and shapes["albedo"] == [6, 3]
+    assert shapes["stencil"] == [6] and shapes["cell_occlusion"] == [4, 4, 4] and shapes["lookup_gains"] == [2]
     fixed = fixed_values(FULL)
-    assert set(fixed) == set(GLOBAL_LEARNABLES)
-    for name in GLOBAL_LEARNABLES:  # a learnable starts where the fixed quantity stands: switching it on changes nothing
+    assert set(GLOBAL_LEARNABLES) - set(fixed) == {"stencil", "occlusion_correction"}
+    for name in fixed:  # a learnable starts where the fixed quantity stands: switching it on changes nothing
         assert torch.equal(described[name].initial, fixed[name])
     assert described["light_position"].scale == GRID.cell_size
 

@@ -9,6 +9,8 @@ from difflpv.config import LpvConfig
 from difflpv.grid import Grid
 from difflpv.illumination import illuminate
 from difflpv.pipeline import Lpv
+from difflpv.propagation import propagate
+from difflpv.scene import PointLight
 
 GRID = Grid((-1.33, -1.27, -1.41), 0.39, (7, 7, 7))
 POSITION, NORMAL = np.array([[0.31, -1.0, 0.22], [-1.0, 0.17, -0.35]]), np.array([[0.0, 1, 0], [1, 0, 0]])
@@ -51,7 +53,7 @@ def test_no_step_is_the_injected_volume():
     """Without propagation a receiver sees only the VPLs next to it."""
     lpv, light, receivers = solved(LpvConfig(steps=0))
     assert lpv(light, receivers).shape == (2, 3)
-    volume = lpv.accumulate(light)
+    (volume,) = lpv.accumulate(light)
     flux = volume[:, 0].sum((1, 2, 3)) * 2 * np.sqrt(np.pi)
     torch.testing.assert_close(flux, light.vpls().flux.sum(0), rtol=1e-5, atol=0)
 
@@ -69,7 +71,8 @@ def test_an_illumination_of_another_grid_or_without_occlusion():
     lpv, light, receivers = solved(LpvConfig(steps=2))
     with pytest.raises(ValueError, match=r"illumination: expected one made for Grid\(minimum=.*got Grid"):
         Lpv(Grid((0.0, 0, 0), 1.0, (3, 3, 3)), lpv.config)(light, receivers)
-    with pytest.raises(ValueError, match="illumination: made without occlusion, this solve needs 'exp'"):
+    message = "illumination: made for 'holpv' with occlusion 'none' on 1 grid.*, this solve needs 'holpv' with 'exp'"
+    with pytest.raises(ValueError, match=message):
         Lpv(GRID, LpvConfig(steps=2, occlusion="exp"))(light, receivers)
 
 
@@ -103,3 +106,74 @@ def test_a_torch_optimiser_moves_it():
         optimizer.step()
         losses.append(loss.item())
     assert losses[0] > losses[1] > losses[2]
+
+
+def test_two_cell_sizes_read_both_grids_and_carry_the_rest_on():
+    """After 2 of 5 steps light goes on in cells of twice the edge: the two solves put together by hand."""
+    config = LpvConfig(method="learned_4x6", steps=5, coarsen_after=2)
+    lpv, light, receivers = solved(config)
+    fine, coarse = lpv.accumulate(light)
+    assert coarse.shape[2:] == tuple(-(-n // 2) for n in fine.shape[2:])
+    one, two = (
+        Lpv(GRID, LpvConfig(method="learned_4x6", steps=n)).accumulate(light)[0] for n in (1, 2)
+    )
+    moving = two - one
+    assert torch.equal(fine, one)
+    padded = torch.nn.functional.pad(moving, [v for n in reversed(moving.shape[2:]) for v in (0, n % 2)])
+    sums = sum(padded[:, :, i::2, j::2, k::2] for i in (0, 1) for j in (0, 1) for k in (0, 1))
+    rest = Lpv(GRID.coarser(), LpvConfig(method="learned_4x6", steps=3))
+    again = illuminate(light.scene, GRID.coarser(), rest.config, light.component)
+    expected = propagate(
+        sums, rest.config.stencil, steps=3, transmittance=again.blocking[0].passed, occlude_first_step=True
+    )
+    torch.testing.assert_close(coarse, expected, rtol=1e-5, atol=1e-7)
+    seen = [Lpv(GRID, LpvConfig(method="learned_4x6", steps=1)).read((fine,), receivers)]
+    seen.append(rest.read((coarse,), again.receivers(receivers.position, receivers.normal)))
+    torch.testing.assert_close(lpv(light, receivers), sum(seen), rtol=1e-4, atol=1e-6)
+
+
+def test_two_cell_sizes_without_steps_left_are_one():
+    config = LpvConfig(method="learned_4x6", steps=3)
+    lpv, light, receivers = solved(config)
+    same = Lpv(GRID, LpvConfig(method="learned_4x6", steps=3, coarsen_after=3))
+    assert torch.equal(same(light, receivers), lpv(light, receivers))
+    with pytest.raises(ValueError, match="on 1 grid.*this solve needs 'learned_4x6' with 'traced' on 2 or more"):
+        Lpv(GRID, LpvConfig(method="learned_4x6", steps=3, coarsen_after=2))(light, receivers)
+    with pytest.raises(ValueError, match="coarsen_after: expected at least 1 step, got 0"):
+        LpvConfig(coarsen_after=0)
+    with pytest.raises(ValueError, match="learn: 'cell_propagation' belongs to one grid, coarsen_after=2 makes two"):
+        Lpv(GRID, LpvConfig(method="learned_4x6", steps=3, coarsen_after=2), learn=["cell_propagation"])
+
+
+def test_a_symmetric_room_stays_symmetric_where_walls_lie_on_coarse_centres():
+    """An even grid around a box puts two walls on planes of coarse cell centres, and two not: all four read the same."""
+    scene = box_scene([PointLight(np.zeros(3), np.ones(3))])
+    config = LpvConfig(method="learned_9x26", steps=16, coarsen_after=4)
+    grid = Grid.around(*scene.bounds, 16)
+    lpv, light, _ = solved(config, scene=scene, grid=grid)
+    walls = np.array([[-1.0, 0, 0], [1, 0, 0], [0, 0, -1], [0, 0, 1]])
+    found = lpv(light, light.receivers(0.999999 * walls, -walls)).mean(1)
+    torch.testing.assert_close(found, found.mean().expand(4), rtol=0.35, atol=0)
+
+
+def test_a_light_that_moves_out_of_its_cells_is_followed():
+    """VPLs are given to the cells they see where they are now, and their gradient does not end a cell away."""
+    config = LpvConfig(method="learned_4x6", steps=0)
+    lpv, light, _ = solved(config, scene=panel_scene(), component="direct", learn=["light_position"])
+    heights = torch.arange(7, dtype=torch.float32) + 0.5
+    for down in (0.0, 0.5, 1.1):
+        value = torch.tensor([[0.0, -down, 0.0]], dtype=torch.float64, requires_grad=True)
+        (volume,) = lpv.accumulate(light, {"light_position": value})
+        flux = volume[:, 0].sum((0, 1, 3))
+        mean = (flux * heights).sum() / flux.sum() * 0.39 - 1.27
+        assert float(mean.detach()) == pytest.approx(1.0 - down - 0.5 * 0.39, abs=0.3 * 0.39)
+        (gradient,) = torch.autograd.grad(mean, value)
+        assert float(gradient[0, 1]) == pytest.approx(1.0, abs=0.5)
+
+
+def test_points_that_are_not_finite_are_named():
+    _, light, _ = solved(LpvConfig(method="learned_4x6", steps=1))
+    with pytest.raises(ValueError, match="position: expected finite numbers, got .*nan.* in row 1"):
+        light.receivers(np.array([[0.0, 0, 0], [0, np.nan, 0]]), np.array([[0.0, 1, 0]] * 2))
+    moving = torch.zeros(1, 3, requires_grad=True)
+    assert len(light.receivers(moving, torch.tensor([[0.0, 1, 0]]))) == 1

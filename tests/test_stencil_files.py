@@ -69,7 +69,8 @@ def test_learned_method_is_linear_in_a_configuration():
     config = LpvConfig(method="learned_4x26")
     assert not config.clamp and config.stencil is learned_stencil("learned_4x26") and config.critical_factor == 1.0
     assert LpvConfig.from_json(config.to_json()) == config
-    for name, value in (("occlusion", "exp"), ("normalization", "thesis"), ("reprojection", "ray")):
+    assert (config.occlusion, config.lookup, config.occlude_first_step) == ("traced", "affine", True)
+    for name, value in (("normalization", "thesis"), ("reprojection", "ray")):
         with pytest.raises(ValueError, match=f"{name}: the linear stencil 'learned_4x26' needs .* got '{value}'"):
             LpvConfig(method="learned_4x26", **{name: value})
     with pytest.raises(ValueError, match="l_max: 'learned_4x26' has 1, got 2"):

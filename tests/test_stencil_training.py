@@ -137,26 +137,41 @@ def test_growth_penalty_is_zero_for_the_published_and_not_above():
 
 @pytest.mark.slow
 def test_training_lowers_the_loss_and_resumes_bit_for_bit(tmp_path):
-    whole = train_stencil("learned_4x6", rounds=4, out=tmp_path / "whole")
+    settings = {"rounds": 4, "rooms": 0}
+    whole = train_stencil("learned_4x6", **settings, out=tmp_path / "whole")
     assert whole.finished and whole.losses[1] > whole.losses[2] > whole.losses[3]  # the first stage reads other shells
     assert stability(whole.stencil).stable and whole.stencil.uniform_gain()[0, 0] == pytest.approx(1, abs=1e-15)
-    part = train_stencil("learned_4x6", rounds=4, minutes=0, out=tmp_path / "part")
+    part = train_stencil("learned_4x6", **settings, minutes=0, out=tmp_path / "part")
     assert part.rounds == 1 and not part.finished
     calls = 1
     while not part.finished:
-        part = train_stencil("learned_4x6", rounds=4, minutes=0, out=tmp_path / "part")
+        part = train_stencil("learned_4x6", **settings, minutes=0, out=tmp_path / "part")
         calls += 1
     assert calls == 4
     assert (part.stencil.matrices == whole.stencil.matrices).all() and part.losses == whole.losses
     assert (load_stencil(tmp_path / "part" / "learned_4x6.safetensors").matrices == whole.stencil.matrices).all()
     with pytest.raises(TrainingError, match=r"made with other settings \(seed\)"):
-        train_stencil("learned_4x6", rounds=4, seed=1, out=tmp_path / "part")
+        train_stencil("learned_4x6", **settings, seed=1, out=tmp_path / "part")
+
+
+@pytest.mark.slow
+def test_rooms_fit_the_gains_alone_and_help_rooms_that_were_not_fitted(tmp_path):
+    start = SHEETS / "learned_9x26.safetensors"
+    result = train_stencil("learned_9x26", start=start, rounds=0, rooms=3, out=tmp_path)
+    assert result.finished and stability(result.stencil).stable
+    assert np.abs(result.stencil.matrices - load_stencil(start).matrices).max() < 1e-12
+    assert all(0.5 < g < 1 for g in result.stencil.lookup_gains)
+    report = json.loads((tmp_path / "learned_9x26.json").read_text())["training"]["rooms"]
+    assert report["held_out_error"] < 0.9 * report["held_out_error_without"]
+    assert load_stencil(tmp_path / "learned_9x26.safetensors").lookup_gains == result.stencil.lookup_gains
+    again = train_stencil("learned_9x26", start=start, rounds=0, rooms=3, out=tmp_path)
+    assert again.stencil.lookup_gains == tuple(report["gains"])
 
 
 def test_training_errors_name_what_was_expected(tmp_path):
     with pytest.raises(TrainingError, match="rung: expected one of learned_4x6.*got 'learned_2x2'"):
         train_stencil("learned_2x2", out=tmp_path)
-    with pytest.raises(TrainingError, match="rounds: expected at least 1, got 0"):
+    with pytest.raises(TrainingError, match="rounds: expected at least 1, or 0 with a stencil to start from, got 0"):
         train_stencil("learned_4x6", rounds=0, out=tmp_path)
     (tmp_path / "learned_4x6.checkpoint").write_bytes(b"junk")
     with pytest.raises(TrainingError, match="checkpoint: damaged"):

@@ -44,7 +44,7 @@ def test_factor_is_silent_at_one_told_above_and_raises_where_it_overflows(name):
     lit = Lit.of(floor_case(), config, "bounce1")
     at, above, beyond = (read(name, p, lit, config, values={"propagation": p}) for p in (1.0, 1.01, 2.0))
     assert at.message == "" and "beyond its critical value 1: light grows up to 1.89 times" in above.message
-    assert beyond.error > 1e6 and beyond.gradient > 1e6 and "light grows" in beyond.message
+    assert beyond.error > 1e4 and beyond.gradient > 1e5 and "light grows" in beyond.message
     longer = replace(config, steps=512)
     over = read(name, 2.0, lit, longer, values={"propagation": 2.0})
     assert over.error is None and "irradiance is not finite: the propagation factor 2 lies beyond" in over.message
@@ -78,8 +78,9 @@ def test_published_kernels_get_worse_as_cells_shrink_and_the_learned_one_does_no
 
 
 def test_a_nearest_deposit_jumps_and_a_trilinear_one_moves_evenly(tmp_path):
-    found = translation(Bench(replace(TINY, moves=16), PLAIN, tmp_path))
-    for name in PLAIN:
+    methods = {name: STRESS_METHODS[name] for name in ("lpv", "holpv", "learned_9x26 open")}
+    found = translation(Bench(replace(TINY, moves=16), methods, tmp_path))
+    for name in methods:
         nearest, trilinear = found.of(f"{name}, nearest"), found.of(f"{name}, trilinear")
         jump, even = max(r.error for r in nearest[1:]), max(r.error for r in trilinear[1:])
         assert sum(r.error > 0 for r in nearest[1:]) == 1 and jump > 5 * even  # one border lies on the way
@@ -94,7 +95,7 @@ def test_a_position_is_not_learned_through_a_nearest_deposit():
         if deposit == "trilinear":
             assert describe_learnables(["light_position"], config, grid_for(scene), scene)
         else:
-            with pytest.raises(ValueError, match="'light_position' needs deposit='trilinear', got 'nearest'"):
+            with pytest.raises(ValueError, match="'light_position' needs deposit='trilinear' or 'visible', got 'nearest'"):
                 describe_learnables(["light_position"], config, grid_for(scene), scene)
 
 

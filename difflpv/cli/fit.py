@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from difflpv.cli.held_out import overfitting, peer_scores, unseen_scene, unseen_scores
 from difflpv.cli.options import (
     COMPONENTS,
     METHODS,
@@ -18,13 +18,14 @@ from difflpv.cli.options import (
     check_indices,
     index_list,
     name_list,
+    natural_float,
     positive_float,
     seeded,
     select_device,
     usage_errors,
 )
 from difflpv.cli.output import Progress, jsonable, make_folder, print_json, warn
-from difflpv.cli.solve import Solve, add_solve, describe_solve, solve_from
+from difflpv.cli.solve import Solve, add_solve, describe_solve, learning_defaults, solve_from
 from difflpv.optim import SOLVERS
 
 if TYPE_CHECKING:
@@ -41,14 +42,20 @@ LEARNABLES = (
     "propagation",
     "propagation_steps",
     "occlusion",
+    "occlusion_correction",
     "sampling_bias",
     "injection_bias",
+    "lookup_gains",
+    "stencil",
+    "cell_propagation",
+    "cell_occlusion",
     "light_intensity",
     "light_color",
     "light_position",
     "albedo",
 )
 LOSSES = ("l2", "log", "image-l1", "image-ssim")
+_CELL_FIELDS = ("cell_propagation", "cell_occlusion")
 _OF_LIGHTS = ("light_intensity", "light_color", "light_position")
 _FAILED, _INTERRUPTED = 1, 130
 
@@ -86,6 +93,12 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         "--budget", type=positive_float, default=60.0, metavar="N", help="forward-equivalents (default: %(default)g)"
     )
+    parser.add_argument(
+        "--sparsity", type=natural_float, metavar="X", help="weight of the mean |log f| of per-cell fields (default: 0.01)"
+    )
+    parser.add_argument(
+        "--unseen", action="append", default=[], metavar="SCENE=DIR", help="judge on another scene with targets too; repeatable"
+    )
     parser.add_argument("--seconds", type=positive_float, metavar="S", help="wall-time limit (default: none)")
     parser.add_argument("--lr", type=positive_float, metavar="X", help="step size of --solver adam (default: 0.05)")
     parser.add_argument("--overwrite", action="store_true", help="start anew instead of going on from DIR's checkpoint")
@@ -99,16 +112,23 @@ def run(args: argparse.Namespace) -> int:
     """Fit, save, and print the table."""
     from data_gen.load import load_targets
     from difflpv.io import load_scene
+    from difflpv.io.atomic import write_json
     from difflpv.optim.result import Status
 
     if args.lr is not None and args.solver != "adam":
         raise UsageError(f"--lr: belongs to --solver adam, got --solver {args.solver}")
+    fields = set(args.learn) & set(_CELL_FIELDS)
+    if args.sparsity and not fields:
+        raise UsageError(f"--sparsity: belongs to --learn {' or '.join(_CELL_FIELDS)}")
+    if args.sparsity is None and fields:
+        args.sparsity = 0.01
     scene = load_scene(args.scene)
     targets = load_targets(args.targets)
     targets.check_scene(scene)
     component = _component(args, targets)
+    others = [unseen_scene(text, args.learn, component) for text in args.unseen]
     train, test = _split(args, len(targets.lights))
-    solve = solve_from(args, scene, **_defaults(args.learn))
+    solve = solve_from(args, scene, **learning_defaults(args.learn, args.method or "holpv"))
     _check_learn(args, scene, solve)
     device = select_device(args.device)
     warn(scene.warnings)
@@ -119,14 +139,18 @@ def run(args: argparse.Namespace) -> int:
     lights = _light_targets(args, scene, targets, solve, component, [*train, *test], device)
     make_folder("--out", args.out)
     outcome = _fit(args, scene, targets, lights, solve, component, train, test)
-    train_scores, test_scores = (_peers(args, outcome, lights, group) for group in (train, test))
+    train_scores, test_scores = (peer_scores(outcome, lights, group) for group in (train, test))
     report = _report(args, outcome, component, train_scores, test_scores)
     _save(args, scene, targets, outcome, component, report)
+    unseen = {u.label: unseen_scores(u, outcome.lpv, component, seed=args.seed, device=device) for u in others}
+    if unseen:  # what was fitted lies there, whatever other scenes do
+        report["unseen"] = {label: [s.to_json() for s in scores] for label, scores in unseen.items()}
+        write_json(args.out / "fit.json", report)
     warn(_lost(lights, outcome))
     if args.json:
         print_json(report)
     else:
-        print(_text(outcome, train_scores, test_scores, args.out))
+        print(_text(outcome, train_scores, test_scores, unseen, args.out))
     if outcome.result.status is Status.INTERRUPTED:
         return _INTERRUPTED
     return _FAILED if outcome.result.status in (Status.NON_FINITE, Status.FAILED) else 0
@@ -169,14 +193,6 @@ def _component(args: argparse.Namespace, targets: Targets) -> Any:
     if args.component not in targets.components:
         raise UsageError(f"--component: {args.targets} has {', '.join(targets.components)}, not {args.component}")
     return args.component
-
-
-def _defaults(learn: Sequence[str]) -> dict[str, str]:
-    """What has to be switched on for a learnable to have a gradient."""
-    wanted = {"occlusion": "exp"} if "occlusion" in learn else {}
-    if {"injection_bias", "light_position"} & set(learn):
-        wanted["deposit"] = "trilinear"
-    return wanted
 
 
 def _check_learn(args: argparse.Namespace, scene: Scene, solve: Solve) -> None:
@@ -277,6 +293,7 @@ def _fit(
                 test=test,
                 solver=args.solver,
                 loss=args.loss,
+                sparsity=args.sparsity or 0.0,
                 budget=args.budget,
                 seconds=args.seconds,
                 seed=args.seed,
@@ -287,29 +304,6 @@ def _fit(
             )
         finally:
             progress.close()
-
-
-def _peers(
-    args: argparse.Namespace, outcome: FitOutcome, lights: Sequence[LightTarget], group: Sequence[int]
-) -> list[Score]:
-    """Means over some lights: constant, as published, untuned at this configuration, fitted."""
-    from difflpv.config import LpvConfig
-    from difflpv.evaluate import mean_score
-    from difflpv.fit import score_lights
-    from difflpv.pipeline import Lpv
-
-    if not group:
-        return []
-    lpv = outcome.lpv
-    method = lpv.config.method
-    constant, untuned, fitted = outcome.mean_scores(group)
-    peers = [constant, replace(untuned, method=f"{method} untuned"), fitted]
-    if method in ("lpv", "holpv"):
-        published = Lpv(lpv.grid, LpvConfig(method=method))
-        name = f"{method} as published"
-        alone = [s for t in lights if t.index in group for s in score_lights(t, {name: published}) if s.method == name]
-        peers.insert(1, mean_score(alone))
-    return peers
 
 
 def _report(
@@ -383,7 +377,9 @@ def _lost(lights: Sequence[LightTarget], outcome: FitOutcome) -> list[str]:
     return lines
 
 
-def _text(outcome: FitOutcome, train: Sequence[Score], test: Sequence[Score], folder: Path) -> str:
+def _text(
+    outcome: FitOutcome, train: Sequence[Score], test: Sequence[Score], unseen: Mapping[str, Sequence[Score]], folder: Path
+) -> str:
     from difflpv.evaluate import format_scores
 
     result = outcome.result
@@ -395,5 +391,8 @@ def _text(outcome: FitOutcome, train: Sequence[Score], test: Sequence[Score], fo
     lines += [f"train lights {_listed(outcome.train)}, loss {result.loss:.4f}", format_scores(train)]
     if test:
         lines += [f"test lights {_listed(outcome.test)}", format_scores(test)]
+        lines += overfitting(train, test)
+    for name, scores in unseen.items():
+        lines += [f"scene '{name}', never seen", format_scores(scores)]
     lines.append(f"model in {folder}")
     return "\n".join(lines)

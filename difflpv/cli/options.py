@@ -33,6 +33,7 @@ __all__ = [
     "light_sets",
     "name_list",
     "natural",
+    "natural_float",
     "positive",
     "positive_float",
     "seeded",
@@ -126,6 +127,14 @@ def positive_float(text: str) -> float:
     value = _number(text)
     if not 0 < value < math.inf:
         raise argparse.ArgumentTypeError(f"expected a number above 0, got '{text}'")
+    return value
+
+
+def natural_float(text: str) -> float:
+    """A finite number >= 0."""
+    value = _number(text)
+    if not 0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"expected a number >= 0, got '{text}'")
     return value
 
 

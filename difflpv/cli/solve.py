@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from difflpv.cli.options import METHODS, UsageError, natural, positive, usage_errors
+from difflpv.cli.options import LEARNED, METHODS, UsageError, natural, positive, usage_errors
 from difflpv.scene import Scene
 
 if TYPE_CHECKING:
@@ -16,11 +17,14 @@ if TYPE_CHECKING:
     from difflpv.grid import Grid
     from difflpv.pipeline import Lpv
 
-__all__ = ["Solve", "add_solve", "describe_solve", "solve_from"]
+__all__ = ["Solve", "add_solve", "describe_solve", "learning_defaults", "solve_from"]
 
 # Option -> field of LpvConfig. The options' defaults are None, so that one that was given can be told from one that
 # was not: a fitted model fixes them all.
-_FIELDS = ("method", "steps", "occlusion", "normalization", "reprojection", "clamp", "deposit", "occlude_first_step")
+_FIELDS = (
+    "method", "steps", "occlusion", "lookup", "normalization", "reprojection", "clamp", "deposit", "occlude_first_step",
+    "coarsen_after",
+)  # fmt: skip
 
 
 def add_solve(parser: Any, *, methods: tuple[str, ...] = METHODS, fitted: bool = True) -> None:
@@ -39,7 +43,15 @@ def add_solve(parser: Any, *, methods: tuple[str, ...] = METHODS, fitted: bool =
     group.add_argument("--steps", type=natural, metavar="N", help="propagation steps (default: 32)")
     occlusion = "none" if fitted else "exp where occlusion is learned, else none"
     group.add_argument(
-        "--occlusion", choices=("none", "clamp", "exp"), help=f"how geometry blocks the volume (default: {occlusion})"
+        "--occlusion",
+        choices=("none", "clamp", "exp", "traced"),
+        help=f"how geometry blocks the volume (default: traced for learned_KxN; {occlusion})",
+    )
+    group.add_argument(
+        "--lookup",
+        choices=("trilinear", "damped", "front", "visible", "affine"),
+        help="cells a receiver may read: all eight (damped: as the HOLPV thesis), those before its plane, those in its sight, "
+        "an affine fit to 27 in its sight (default: affine for learned_KxN, else trilinear)",
     )
     group.add_argument(
         "--normalization", choices=("energy", "thesis"), help="energy keeps the flux, thesis a quarter (default: energy)"
@@ -54,15 +66,22 @@ def add_solve(parser: Any, *, methods: tuple[str, ...] = METHODS, fitted: bool =
         default=None,
         help="let negative intensity carry negative flux: makes transport linear (default: clamp)",
     )
-    deposit = "nearest" if fitted else "trilinear where injection_bias or light_position is learned, else nearest"
+    deposit = "visible for learned_KxN, else nearest"
+    deposit += "" if fitted else "; trilinear where injection_bias or light_position is learned"
     group.add_argument(
-        "--deposit", choices=("nearest", "trilinear"), help=f"how VPLs enter the cells (default: {deposit})"
+        "--deposit", choices=("nearest", "trilinear", "visible"), help=f"how VPLs enter the cells (default: {deposit})"
     )
     group.add_argument(
         "--occlude-first-step",
-        action="store_true",
+        action=argparse.BooleanOptionalAction,
         default=None,
-        help="block the first step too (default: the publications leave it free)",
+        help="block the first step too (default: with traced occlusion; the publications leave it free)",
+    )
+    group.add_argument(
+        "--coarsen-after",
+        type=positive,
+        metavar="N",
+        help="after N steps light goes on in cells of twice the edge, at an eighth of the cost (default: one grid)",
     )
     if fitted:
         group.add_argument(
@@ -75,7 +94,7 @@ class Solve:
     """What is to be solved, and by which model.
 
     Attributes:
-        method: "lpv", "holpv" or "constant".
+        method: of the volume, or "constant".
         config: of the volume; of HOLPV for "constant", which does not use it.
         grid: cells.
         record: the fitted model's file, or None.
@@ -132,12 +151,15 @@ def _fitted(args: argparse.Namespace, scene: Scene, folder: Path, given: dict[st
     for name, value in given.items():
         fixed = getattr(record.config, name)
         if value != fixed:
-            option = "--no-clamp" if name == "clamp" else "--" + name.replace("_", "-")
+            option = "--no-clamp" if name == "clamp" else "--" + ("no-" if value is False else "") + name.replace("_", "-")
             shown = "" if isinstance(value, bool) else f" {value}"
             raise UsageError(f"{option}{shown}: the fitted model in {folder} has {name} {fixed}")
     grid = record.grid
     made_for = record.provenance.get("scene")
     same_scene = isinstance(made_for, dict) and made_for.get("hash") == scene.hash
+    fields = sorted({"cell_propagation", "cell_occlusion"} & set(record.values))
+    if fields and (args.grid is not None or not same_scene):
+        raise UsageError(f"--fitted: {', '.join(fields)} of {folder} belong to the scene and grid that were fitted")
     if args.grid is not None or not same_scene:
         with usage_errors():
             grid = grid_for(scene, args.grid or record.grid.resolution[0])
@@ -155,7 +177,24 @@ def describe_solve(solve: Solve) -> str:
         f"grid {cells} cells of {grid.cell_size:.4g} m",
         f"{config.steps} steps",
         f"occlusion {config.occlusion}",
+        f"lookup {config.lookup}",
         f"deposit {config.deposit}",
         f"normalization {config.normalization}",
     ]
+    if config.fine_steps < config.steps:
+        parts.insert(3, f"the last {config.steps - config.fine_steps} in cells of twice the edge")
     return ", ".join(parts + ([] if config.clamp else ["no clamp"]))
+
+
+def learning_defaults(learn: Sequence[str], method: str) -> dict[str, str]:
+    """What has to be switched on for a learnable to have a gradient."""
+    wanted = {}
+    if {"occlusion", "cell_occlusion"} & set(learn) and method not in LEARNED:
+        wanted["occlusion"] = "exp"
+    if "occlusion_correction" in learn:
+        wanted["occlusion"] = "traced"
+    if "sampling_bias" in learn:
+        wanted["lookup"] = "trilinear"
+    if {"injection_bias", "light_position"} & set(learn) and method not in LEARNED:
+        wanted["deposit"] = "trilinear"
+    return wanted

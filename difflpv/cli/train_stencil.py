@@ -1,4 +1,4 @@
-"""``difflpv train-stencil``: learn a propagation stencil from closed forms in free space."""
+"""``difflpv train-stencil``: learn a propagation stencil, in free space and in rooms."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import textwrap
 from pathlib import Path
 from typing import Any
 
-from difflpv.cli.options import LEARNED, UsageError, add_output, positive, positive_float, seeded
+from difflpv.cli.options import LEARNED, UsageError, add_output, natural, positive_float, seeded
 from difflpv.cli.output import print_json
 
 __all__ = ["add_parser", "run"]
@@ -18,10 +18,11 @@ def add_parser(subparsers: Any) -> None:
     """Add the command."""
     parser = subparsers.add_parser(
         "train-stencil",
-        help="learn a propagation stencil in free space",
+        help="learn a propagation stencil in free space and in rooms",
         description=textwrap.fill(
-            "Trains one rung of the learned stencils on the closed form of a cosine emitter in free space: cube-symmetric, "
-            "conserving, stable. Writes RUNG.safetensors and RUNG.json. A run that was cut off goes on where it stopped.",
+            "Trains one rung of the learned stencils, cube-symmetric, conserving and stable: on the closed form of a cosine "
+            "emitter in free space, then on path-traced rooms drawn at random, for the gains of receivers on walls by "
+            "degree. Writes RUNG.safetensors and RUNG.json. A run that was cut off goes on where it stopped.",
             100,
         ),
         epilog="example:\n  difflpv train-stencil learned_9x26 --quick --out out/stencils",
@@ -30,7 +31,10 @@ def add_parser(subparsers: Any) -> None:
     parser.set_defaults(run=run)
     parser.add_argument("rung", metavar="RUNG", choices=LEARNED, help=", ".join(LEARNED))
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the stencil and its checkpoint")
-    parser.add_argument("--rounds", type=positive, metavar="N", help="rounds of 10 L-BFGS iterations (default: the rung's own)")
+    parser.add_argument(
+        "--rounds", type=natural, metavar="N", help="rounds of 10 L-BFGS iterations in free space (default: the rung's own)"
+    )
+    parser.add_argument("--rooms", type=natural, metavar="N", help="rooms for the receivers' gains, 0 for none (default: 28)")
     parser.add_argument("--minutes", type=positive_float, metavar="M", help="stop after the round that exceeds M minutes")
     parser.add_argument("--start", type=Path, metavar="FILE", help="stencil to start from (default: the published kernel)")
     parser.add_argument("--no-resume", dest="resume", action="store_false", help="start anew, whatever lies in DIR")
@@ -49,6 +53,7 @@ def run(args: argparse.Namespace) -> int:
         args.rung,
         seed=args.seed,
         rounds=args.rounds,
+        rooms=args.rooms,
         minutes=args.minutes,
         out=args.out,
         start=args.start,
@@ -64,6 +69,7 @@ def run(args: argparse.Namespace) -> int:
                 "rung": args.rung,
                 "path": str(path),
                 "rounds": result.rounds,
+                "lookup_gains": result.stencil.lookup_gains,
                 "finished": result.finished,
                 "errors": result.errors,
                 "blended": result.blended,
@@ -72,5 +78,8 @@ def run(args: argparse.Namespace) -> int:
         return 0
     for shell, error in result.errors.items():
         print(f"{shell}: relative L2 error {error:.4f}")
-    print(f"{path}: {result.rounds} rounds" + ("" if result.finished else ", not finished: run the command again to go on"))
+    unfinished = "" if result.finished else ", not finished: run the command again to go on"
+    gains = ", ".join(f"{g:.3f}" for g in result.stencil.lookup_gains)
+    print(f"gains of receivers on walls by degree: {gains}")
+    print(f"{path}: {result.rounds} rounds in free space{unfinished}")
     return 0

@@ -132,8 +132,8 @@ def run_demo(
 
     progress("judging and rendering")
     scores = _judge(models, traced)
-    direct = _light_targets(scene, targets, sizes.published("lpv"), "direct", sizes, seed)
-    scores += _judge({name: models[name] for name in UNFITTED}, {m: direct for m in _METHODS})
+    direct = {m: _light_targets(scene, targets, sizes.published(m), "direct", sizes, seed) for m in _METHODS}
+    scores += _judge({name: models[name] for name in UNFITTED}, direct)
     lit: dict[str, Illumination] = {method: lights[sizes.image_light].illumination for method, lights in traced.items()}
     views = render_views(lit, {name: models[name] for name in _IN_PICTURE}, sizes, truth, noise)
     values: dict[str, Any] = {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from difflpv.config import LpvConfig, Method, Occlusion
+from difflpv.config import LpvConfig, Method
 
 __all__ = ["FITS", "SCENE", "UNFITTED", "DemoSettings", "FitPlan"]
 
@@ -78,13 +78,14 @@ class DemoSettings:
         return {"lpv": self.lpv_budget, "holpv": self.holpv_budget}.get(method, self.learned_budget)
 
     def published(self, method: Method) -> LpvConfig:
-        """The solve as published, or as trained in free space: no occlusion, light deposited in the nearest cell."""
+        """The solve as published, or as trained."""
         return LpvConfig(method=method, steps=self.steps)
 
     def fitted(self, method: Method) -> LpvConfig:
-        """The solve whose factors are fitted: smooth deposit, and smooth occlusion where the stencil has faces."""
-        occlusion: Occlusion = "exp" if method in ("lpv", "holpv") else "none"
-        return LpvConfig(method=method, steps=self.steps, occlusion=occlusion, deposit="trilinear")
+        """The solve that is fitted: the published kernels with smooth deposit and occlusion, a learned one as it is."""
+        if method in ("lpv", "holpv"):
+            return LpvConfig(method=method, steps=self.steps, occlusion="exp", deposit="trilinear")
+        return LpvConfig(method=method, steps=self.steps)
 
 
 @dataclass(frozen=True)
@@ -114,6 +115,6 @@ FITS: tuple[FitPlan, ...] = (
         "learned_9x26 fitted",
         "learned_9x26",
         "lbfgs",
-        ("propagation", "sampling_bias", "injection_bias", "propagation_steps"),
+        ("propagation", "propagation_steps", "occlusion", "occlusion_correction", "lookup_gains", "stencil"),
     ),
 )

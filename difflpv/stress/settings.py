@@ -14,7 +14,9 @@ STRESS_METHODS: dict[str, LpvConfig] = {
     "lpv exp": LpvConfig(method="lpv", occlusion="exp"),
     "holpv": LpvConfig(method="holpv"),
     "holpv exp": LpvConfig(method="holpv", occlusion="exp"),
+    "learned_9x26 open": LpvConfig(method="learned_9x26", occlusion="none", lookup="trilinear", deposit="nearest"),
     "learned_9x26": LpvConfig(method="learned_9x26"),
+    "learned_9x26 two sizes": LpvConfig(method="learned_9x26", coarsen_after=6),
 }
 
 

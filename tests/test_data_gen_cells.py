@@ -1,0 +1,40 @@
+import math
+
+import numpy as np
+import pytest
+from hand_scenes import box_scene, panel_scene
+
+from data_gen.cells import true_volume
+from difflpv.grid import Grid
+
+GRID = Grid((-0.6, 0.2, -0.6), 0.4, (3, 2, 3))
+
+
+def panel_solid_angle(x):
+    """Of panel_scene's 1 x 0.6 m rectangle at y = 1 from points [n,3] below it [sr]."""
+    d = 1.0 - x[:, 1]
+
+    def corner(a, b):
+        return np.arctan2(a * b, d * np.sqrt(a * a + b * b + d * d))
+
+    low_x, high_x, low_z, high_z = -0.5 - x[:, 0], 0.5 - x[:, 0], -0.3 - x[:, 2], 0.3 - x[:, 2]
+    return corner(high_x, high_z) - corner(low_x, high_z) - corner(high_x, low_z) + corner(low_x, low_z)
+
+
+def test_fluence_of_a_panel_against_its_solid_angle():
+    """c_00 = Y_00 times the integral of radiance over directions = Y_00 L Omega; below the panel all of it travels down."""
+    volume = true_volume(panel_scene(), GRID, "direct", spp=4096)
+    assert volume.shape == (3, 9, *GRID.shape)
+    omega = panel_solid_angle(GRID.cell_centers().reshape(-1, 3)).reshape(GRID.shape)
+    radiance = np.array([5.0, 3.0, 1.0])[:, None, None, None]
+    expected = 0.4**2 * 0.5 / math.sqrt(math.pi) * radiance * omega
+    np.testing.assert_allclose(volume[:, 0], expected, rtol=0.02)
+    assert (volume[:, 1] < 0).all()  # Y_1-1 = y: the light travels towards -y
+
+
+def test_punctual_lights_are_left_to_the_exact_part_and_seeds_repeat():
+    assert not true_volume(box_scene(), GRID, "direct").any()
+    first, again = (true_volume(box_scene(), GRID, "bounce1", spp=32, seed=3) for _ in range(2))
+    assert np.array_equal(first, again) and first[:, 0].min() > 0
+    with pytest.raises(ValueError, match="component 'bounce'"):
+        true_volume(box_scene(), GRID, "bounce")
