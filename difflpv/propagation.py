@@ -1,9 +1,9 @@
 """Propagation of a volume through its grid: all steps in one differentiable op.
 
 ``propagate`` picks what is fastest for the stencil: one matrix per neighbour (a learned stencil) runs on torch's ``conv3d``
-with our adjoint (``difflpv.convolution``) or, with occlusion, on Warp kernels (``difflpv.linear_propagation``); faces run on
-the Warp kernels of ``difflpv.face_propagation``, with or without clamp and occlusion: their 30 or 54 fluxes are fewer products
-than the convolution's dense matrices (0.6 to 0.8 of its time, benchmarks/propagation.py). All agree with
+with our adjoint (``difflpv.convolution``) or, with occlusion or on CUDA, on Warp kernels (``difflpv.linear_propagation``);
+faces run on the Warp kernels of ``difflpv.face_propagation``, with or without clamp and occlusion: their 30 or 54 fluxes
+are fewer products than the convolution's dense matrices (0.6 to 0.8 of its time, benchmarks/propagation.py). All agree with
 ``difflpv.reference.propagation``, and a face stencil's linear part runs on any of them.
 """
 
