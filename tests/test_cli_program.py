@@ -108,6 +108,11 @@ def test_a_closed_pipe_is_quiet():
     assert (process.returncode, err) == (141, b"")
 
 
+def hear_ctrl_c():
+    """A shell starts its background jobs deaf to SIGINT, and children inherit that: tests run there too."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="needs SIGINT")
 def test_ctrl_c_in_a_fit_saves_and_goes_on(tmp_path):
@@ -116,7 +121,9 @@ def test_ctrl_c_in_a_fit_saves_and_goes_on(tmp_path):
     targets, out = make_targets(tmp_path, scene), tmp_path / "fit"
     command = [*PROGRAM, "fit", scene, "--targets", targets, "--learn", "propagation,sampling_bias", "--solver", "adam",
                "--budget", "1e9", "--out", out]  # fmt: skip
-    process = subprocess.Popen([str(a) for a in command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [str(a) for a in command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=hear_ctrl_c
+    )
     deadline = time.monotonic() + 90
     while not (out / "checkpoint.pt").exists() and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.2)
