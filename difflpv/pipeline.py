@@ -101,7 +101,7 @@ class Lpv(torch.nn.Module):
 
     def step_factors(self, values: Mapping[str, torch.Tensor] | None = None) -> torch.Tensor:
         """Propagation factor of each step [steps], float64, detached; ``values`` as in ``forward``."""
-        merged = {**self._fixed, **self.values(), **(values or {})}
+        merged = self._merged(values)
         return (merged["propagation"] * merged["propagation_steps"]).detach().double().cpu()
 
     def save(self, folder: str | Path, *, provenance: Mapping[str, Any] | None = None) -> None:
@@ -171,7 +171,7 @@ class Lpv(torch.nn.Module):
         )
         matrices = None
         if self._coordinates is not None:
-            z = (values or {}).get("stencil", self.values()["stencil"])  # as it is: not in the precision of the light
+            z = self._merged(values)["stencil"]  # not in the precision of the light
             matrices = self._coordinates.matrices(z.cpu().double()).to(volume)
         factors, first = v["propagation"] * v["propagation_steps"], config.fine_steps
 
@@ -252,8 +252,11 @@ class Lpv(torch.nn.Module):
         return torch.stack(parts).sum(0)
 
     def _complete(self, values: Mapping[str, torch.Tensor] | None, like: torch.Tensor) -> dict[str, torch.Tensor]:
-        merged = {**self._fixed, **self.values(), **(values or {})}
-        return {name: value.to(dtype=like.dtype, device=like.device) for name, value in merged.items()}
+        return {name: value.to(dtype=like.dtype, device=like.device) for name, value in self._merged(values).items()}
+
+    def _merged(self, values: Mapping[str, torch.Tensor] | None) -> dict[str, torch.Tensor]:
+        """Everything that a solve needs, as it is held: fixed, then learned, then given."""
+        return {**self._fixed, **self.values(), **(values or {})}
 
     def _not_finite(self, values: Mapping[str, torch.Tensor]) -> str:
         gain = float((values["propagation"] * values["propagation_steps"]).max()) if self.config.steps else 0.0

@@ -128,7 +128,7 @@ def run_demo(
             seed=seed,
             progress=progress,
         )
-        fits[plan.name]["factors"] = _step_factors(models[plan.name])
+        fits[plan.name]["factors"] = models[plan.name].step_factors().tolist()
 
     progress("judging and rendering")
     scores = _judge(models, traced)
@@ -192,14 +192,6 @@ def _light_targets(
         )
         for k in sizes.lights
     }
-
-
-def _step_factors(lpv: Lpv) -> list[float]:
-    """The factor of each propagation step."""
-    values = {name: value.detach() for name, value in lpv.values().items()}
-    overall = float(values["propagation"]) if "propagation" in values else 1.0
-    by_step = values["propagation_steps"].tolist() if "propagation_steps" in values else [1.0] * lpv.config.steps
-    return [overall * factor for factor in by_step]
 
 
 def _judge(models: Mapping[str, Lpv], lights: Mapping[Method, Mapping[int, LightTarget]]) -> list[Score]:
