@@ -157,7 +157,7 @@ LIBRARY_OWNERS: dict[str, tuple[str, ...]] = {
     "nlopt": ("difflpv.optim.nlopt_solver",),
     "cma": ("difflpv.optim.cma_solver",),
     "kornia": ("difflpv.loss",),
-    "safetensors": ("difflpv.fitted", "difflpv.stencil_files"),
+    "safetensors": ("difflpv.fitted", "difflpv.probes.probe_files", "difflpv.stencil_files"),
     "matplotlib": ("difflpv.report", "scripts"),
     "tqdm": ("data_gen", "difflpv.cli", "scripts"),
     "mitsuba": (),
