@@ -48,6 +48,7 @@ LAYERS: tuple[tuple[str, tuple[str, ...]], ...] = (
             "difflpv.direct",
             "difflpv.face_propagation",
             "difflpv.injection",
+            "difflpv.io.exports",  # formats of engines: they know light probes, which difflpv.io below does not
             "difflpv.linear_propagation",
             "difflpv.lookup",
             "difflpv.loss",

@@ -18,6 +18,7 @@ _LAZY = {
     "data_gen.blocks": ("WorkerError", _FAILED),
     "difflpv.io.exr": ("ImageError", _BAD_INPUT),
     "difflpv.fitted": ("FittedError", _BAD_INPUT),
+    "difflpv.io.exports.convention": ("ExportError", _BAD_INPUT),
     "difflpv.probes.probe_files": ("ProbeFileError", _BAD_INPUT),
     "difflpv.stencil_files": ("StencilError", _BAD_INPUT),
     "difflpv.training.stencils": ("TrainingError", _BAD_INPUT),

@@ -1,0 +1,82 @@
+"""``difflpv probes``: the group and its export."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cli_room import difflpv
+
+from difflpv.cli.probes import SUBCOMMANDS
+from difflpv.cli.probes.export import FORMATS
+from difflpv.io.exports import EXPORT_FORMATS
+from difflpv.probes.probe_files import ProbeRecord, save_probes
+from difflpv.probes.probe_set import ProbeSet
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    rng = np.random.default_rng(1)
+    probes = ProbeSet(rng.normal(size=(6, 3)), rng.normal(size=(6, 9, 3)), np.arange(6) != 2)
+    save_probes(tmp_path / "probes", ProbeRecord(probes, {"name": "box", "hash": "ab"}))
+    return tmp_path / "probes"
+
+
+def test_group_names_its_subcommands(capsys) -> None:
+    assert difflpv("probes", "--help") == 0
+    text = capsys.readouterr().out
+    assert all(re.search(rf"^ +{name.replace('_', '-')}\b", text, re.M) for name in SUBCOMMANDS)
+    assert difflpv("probes") == 2
+    told = "the following arguments are required: COMMAND (see 'difflpv probes --help')"
+    assert capsys.readouterr().err == f"difflpv: error: {told}\n"
+
+
+@pytest.mark.parametrize("name", SUBCOMMANDS)
+def test_each_subcommand_explains_itself_with_an_example(name, capsys) -> None:
+    assert difflpv("probes", name.replace("_", "-"), "--help") == 0
+    options, _, example = capsys.readouterr().out.partition("example:")
+    assert f"difflpv probes {name.replace('_', '-')} " in example
+    assert all(option in options for option in re.findall(r"--[a-z-]+", example))
+
+
+def test_formats_are_those_of_the_library() -> None:
+    assert FORMATS == EXPORT_FORMATS  # written out in the command, whose help loads no torch
+    program = "import sys; from difflpv.cli import main; main(['probes', 'export', '--help']); sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program], capture_output=True, timeout=60).returncode == 0
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_export_writes_what_it_says(format, folder, tmp_path, capsys) -> None:
+    out = tmp_path / {"threejs": "a.json", "gltf": "a.gltf", "exr": "a.exr"}.get(format, "a")
+    assert difflpv("probes", "export", folder, "--format", format, "--out", out, "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["command"], told["format"], told["probes"], told["invalid"]) == ("probes export", format, 5, 1)
+    sizes = [Path(file).stat().st_size for file in told["files"]]
+    assert all(sizes) and sum(sizes) == told["bytes"]
+    assert difflpv("probes", "export", folder, "--format", format, "--out", out) == 0
+    assert capsys.readouterr().out.startswith(f"5 probes (1 invalid ones left out) for {format} -> ")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--format", "exr", "--mirror", "z"], "--mirror: belongs to --format unity, got --format exr"),
+        (["--format", "unity", "--height", "4"], "--height: belongs to --format exr, got --format unity"),
+        (["--format", "gltf"], "expected a file name ending in .gltf"),
+        (["--format", "unreal"], "argument --format: invalid choice: 'unreal'"),
+    ],
+)
+def test_errors_are_one_line(arguments, message, folder, tmp_path, capsys) -> None:
+    assert difflpv("probes", "export", folder, *arguments, "--out", tmp_path / "a.out") == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+
+
+def test_no_probes_there_is_one_line(tmp_path, capsys) -> None:
+    assert difflpv("probes", "export", tmp_path, "--format", "gltf", "--out", tmp_path / "a.gltf") == 2
+    assert capsys.readouterr().err.startswith(f"difflpv: error: {tmp_path / 'probes.json'}: not found: expected a folder")
