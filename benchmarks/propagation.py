@@ -14,31 +14,20 @@ from __future__ import annotations
 
 import argparse
 import json
-import statistics
-import time
 from collections.abc import Callable
 
 import torch
 
+from difflpv.bench.timing import interleaved
 from difflpv.propagation import propagate
 from difflpv.stencil import FaceStencil, LinearStencil, holpv_stencil, lpv_stencil
 from difflpv.stencil_files import learned_stencil
 
 
-def interleaved(calls: dict[str, Callable[[], object]], repeats: int, device: torch.device) -> dict[str, float]:
-    """Median seconds of each call, taken in turns after one warm-up; those named "torch ..." run twice at most."""
-    times: dict[str, list[float]] = {name: [] for name in calls}
-    for round_number in range(-1, repeats):
-        for name, call in calls.items():
-            if name.startswith("torch") and round_number >= 2:
-                continue
-            start = time.perf_counter()
-            call()
-            if device.type == "cuda":
-                torch.cuda.synchronize(device)
-            if round_number >= 0:
-                times[name].append(time.perf_counter() - start)
-    return {name: statistics.median(values) for name, values in times.items()}
+def medians(calls: dict[str, Callable[[], object]], repeats: int, device: torch.device) -> dict[str, float]:
+    """Median seconds of each call, taken in turns; those named "torch ..." run twice at most."""
+    times = interleaved(calls, repeats, device=device, few=lambda name: name.startswith("torch"))
+    return {name: timing.median for name, timing in times.items()}
 
 
 def torch_faces(volume: torch.Tensor, stencil: FaceStencil, factors: torch.Tensor, passed: torch.Tensor) -> torch.Tensor:
@@ -119,7 +108,7 @@ def measure_pairs(stencil: LinearStencil, cells: int, steps: int, repeats: int, 
     }
     calls: dict[str, Callable[[], object]] = {"conv3d forward": conv_forward, "occlusion forward": forward}
     calls |= {f"occlusion both, {kind}": both(*learned) for kind, learned in kinds.items()}
-    t = interleaved(calls, repeats, device)
+    t = medians(calls, repeats, device)
     table = {f"{name} [ms]": 1e3 * seconds for name, seconds in t.items()}
     table["step with occlusion / conv3d"] = t["occlusion forward"] / t["conv3d forward"]
     for kind in kinds:
@@ -180,7 +169,7 @@ def measure(
     }
     if own_only:
         calls = {name: call for name, call in calls.items() if not name.startswith("torch")}
-    t = interleaved(calls, repeats, device)
+    t = medians(calls, repeats, device)
     occluded = t["clamp+occlusion forward"]
     table = {f"{name} [ms]": 1e3 * seconds for name, seconds in t.items()}
     table |= {

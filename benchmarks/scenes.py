@@ -20,7 +20,7 @@ import torch
 from data_gen.cells import true_volume
 from data_gen.targets import make_targets
 from difflpv.config import LpvConfig, grid_for
-from difflpv.evaluate import predict_constant, score
+from difflpv.evaluate import predict_constant, relative_noise, score
 from difflpv.illumination import illuminate
 from difflpv.io import load_scene
 from difflpv.io.atomic import write_text
@@ -96,9 +96,7 @@ def table_of(scene: Scene, components: tuple[str, ...], folder: Path) -> list[st
     x, n, weight = receivers.position[inside], receivers.normal[inside], light.area_weight[inside]
     dark = x[:, 0] > FAR_ROOM if scene.name == "two_rooms_90" else None
     truths = {c: light.irradiance[c][inside] for c in components}
-    area = weight[:, None]
-    errors = {c: light.standard_error[c][inside] for c in components}
-    noise = [float(np.sqrt((area * errors[c] ** 2).sum() / (area * truths[c] ** 2).sum())) for c in components]
+    noise = [relative_noise(light.standard_error[c][inside], truths[c], weight) for c in components]
     grid = grid_for(scene)
     size = " x ".join(map(str, grid.resolution))
     lines = [

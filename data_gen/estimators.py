@@ -27,7 +27,9 @@ __all__ = ["REPLICATES", "image_block", "irradiance_block", "probe_block"]
 REPLICATES = 32
 
 
-def _by_replicate(buckets: np.ndarray, components: Components, entities: int, samples: int) -> np.ndarray:
+def _by_replicate(
+    buckets: np.ndarray, components: Components, entities: int, samples: int, replicates: int = REPLICATES
+) -> np.ndarray:
     """Means of each replicate's samples.
 
     Args:
@@ -35,12 +37,13 @@ def _by_replicate(buckets: np.ndarray, components: Components, entities: int, sa
         components: what to sum the buckets to.
         entities: receivers, probes or pixels.
         samples: samples per replicate.
+        replicates: of each entity.
 
     Returns:
         Shape [replicates, entities, components, c], float64.
     """
     count, channels, _ = buckets.shape
-    means = buckets.reshape(count, channels, entities, REPLICATES, samples).mean(-1, dtype=np.float64)
+    means = buckets.reshape(count, channels, entities, replicates, samples).mean(-1, dtype=np.float64)
     total = np.zeros((len(components.names), *means.shape[1:]))
     for row, members in zip(total, components.membership, strict=True):
         for bucket in np.flatnonzero(members):
@@ -58,6 +61,7 @@ def irradiance_block(
     seed: int,
     address: tuple[int, ...],
     round: int = 0,
+    replicates: int = REPLICATES,
 ) -> np.ndarray:
     """Irradiance of a few receivers.
 
@@ -70,13 +74,14 @@ def irradiance_block(
         seed: seed of the run.
         address: integers that name these entities.
         round: which part of each replicate's samples.
+        replicates: independent estimates of each receiver.
 
     Returns:
-        Irradiance [W/m2], shape [REPLICATES, n, components, 3].
+        Irradiance [W/m2], shape [replicates, n, components, 3].
     """
     n = len(positions)
-    stream = SampleStream(seed, *address, groups=n * REPLICATES, samples=samples, round=round)
-    per_receiver = REPLICATES * samples
+    stream = SampleStream(seed, *address, groups=n * replicates, samples=samples, round=round)
+    per_receiver = replicates * samples
     points = np.repeat(np.asarray(positions.T, np.float32), per_receiver, 1)
     axes = np.repeat(np.asarray(normals.T, np.float32), per_receiver, 1)
     directions = rotate_to(cosine_hemisphere(stream.uniform(0, 2)), axes)
@@ -89,7 +94,7 @@ def irradiance_block(
     if direct >= 0:
         buckets[direct] += tracer.area_irradiance(points, axes, stream.uniform(2, 2))
         delta = tracer.delta_irradiance(np.asarray(positions.T, np.float64), np.asarray(normals.T, np.float64)).T
-    means = _by_replicate(buckets, components, n, samples)
+    means = _by_replicate(buckets, components, n, samples, replicates)
     if direct >= 0:
         means += delta[None, :, None, :] * components.membership[None, None, :, direct, None]
     return means

@@ -24,6 +24,7 @@ from data_gen.estimators import REPLICATES, irradiance_block
 from data_gen.pathtracer import PathTracer
 from data_gen.rng import generator
 from data_gen.samplers import cosine_hemisphere, rotate_to, triangle_barycentric
+from difflpv.grid import Grid
 from difflpv.io.tables import ReceiverTable
 from difflpv.scene import Mesh, Scene
 
@@ -42,6 +43,10 @@ class _SurfacePoints:
     position: np.ndarray
     normal: np.ndarray
 
+    def at(self, index: np.ndarray) -> _SurfacePoints:
+        """Some of the points."""
+        return _SurfacePoints(self.triangle[index], self.barycentric[index], self.position[index], self.normal[index])
+
 
 def grey_twin(scene: Scene) -> Scene:
     """The same geometry and lights with albedo 1/2 everywhere: where light can get to, whatever the materials."""
@@ -52,13 +57,14 @@ def grey_twin(scene: Scene) -> Scene:
     return replace(scene, meshes=tuple(grey(mesh) for mesh in scene.meshes))
 
 
-def draw_receivers(scene: Scene, count: int, seed: int = 0) -> ReceiverTable:
+def draw_receivers(scene: Scene, count: int, seed: int = 0, *, within: Grid | None = None) -> ReceiverTable:
     """Draw receivers by area on all surfaces that do not emit.
 
     Args:
         scene: the scene, under the lights that decide the lit side.
         count: number of receivers.
         seed: equal seeds draw equal receivers.
+        within: only where this grid reaches; everywhere if None.
 
     Returns:
         Table with albedo, area weights [m2] (all equal: area that is not buried / count) and ``mesh_id`` [n].
@@ -76,13 +82,16 @@ def draw_receivers(scene: Scene, count: int, seed: int = 0) -> ReceiverTable:
     drawn = count
     for attempt in range(12):
         points = _draw_points(scene, area, drawn, seed, attempt)
+        if within is not None:
+            points = points.at(within.contains(points.position))
         side = _free_sides(tracer, points, seed, attempt)
         kept = np.flatnonzero(side)
         if len(kept) >= count:
             break
         drawn = int(np.ceil(drawn * min(1.02 * count / max(len(kept), 1), 16)))
     else:
-        raise ValueError(f"scene '{scene.name}': nearly all is buried, found {len(kept)} of {count} receivers")
+        where = "buried" if within is None else "buried or outside the grid"
+        raise ValueError(f"scene '{scene.name}': nearly all is {where}, found {len(kept)} of {count} receivers")
     # the stratified order runs along the triangles: leave out at random, not the tail
     chosen = np.sort(generator(seed, _STREAM, 2).permutation(kept)[:count])
     triangle = points.triangle[chosen]

@@ -10,7 +10,7 @@ import torch
 
 from difflpv.loss import best_scale, mean_error, percentile_error, relative_l2
 
-__all__ = ["Score", "format_scores", "mean_score", "predict_constant", "score"]
+__all__ = ["Score", "format_scores", "mean_score", "predict_constant", "relative_noise", "score"]
 
 
 @dataclass(frozen=True)
@@ -70,6 +70,23 @@ def predict_constant(target: np.ndarray, weight: np.ndarray) -> np.ndarray:
     """The area-weighted mean of the targets at every receiver, [n,3]: what every method has to beat."""
     mean = (weight[:, None] * target).sum(0) / weight.sum()
     return np.broadcast_to(mean, target.shape).copy()
+
+
+def relative_noise(standard_error: np.ndarray, target: np.ndarray, weight: np.ndarray) -> float:
+    """Relative L2 error that a perfect prediction would show against targets [n,3] of this standard error [n,3].
+
+    Args:
+        standard_error: of the targets [W/m2].
+        target: irradiance [W/m2].
+        weight: area weights [n].
+
+    Raises:
+        ValueError: a target that is zero everywhere.
+    """
+    power = float((weight[:, None] * np.asarray(target, float) ** 2).sum())
+    if not power > 0:
+        raise ValueError("target: expected a value other than zero under a positive weight, got none")
+    return float(np.sqrt((weight[:, None] * np.asarray(standard_error, float) ** 2).sum() / power))
 
 
 def mean_score(scores: Sequence[Score]) -> Score:

@@ -211,6 +211,7 @@ def illuminate(
     rsm_resolution: int = 128,
     texel_flux: TexelFlux = "exact",
     blockers: Literal["surface", "rsm"] = "surface",
+    blocking: tuple[Blocking, ...] | None = None,
     seed: int = 0,
     dtype: torch.dtype = torch.float32,
     device: torch.device | str = "cpu",
@@ -229,19 +230,24 @@ def illuminate(
         texel_flux: what a texel receives, see ``difflpv.rsm.render_rsm``.
         blockers: what fills the geometry volume: all surfaces by area, or only what the RSMs see (the publications); a
             linear stencil's pairs of cells see each of them from both sides.
+        blocking: of an earlier illumination of the same geometry on these grids with this occlusion, such as under other
+            lights: what stands between cells is then not traced again.
         seed: of all samples.
         dtype: float32 to run, float64 to check gradients.
         device: where the solve runs.
 
     Raises:
         SceneError: a scene too small, too large or too far from the origin for the float32 of rays and form factors.
-        ValueError: an unknown choice, or ``blockers="rsm"`` where no light has an RSM.
+        ValueError: an unknown choice, ``blockers="rsm"`` where no light has an RSM, or ``blocking`` of another number of
+            grids.
     """
     _check_extent(scene)
     if component not in get_args(Component):
         raise ValueError(f"component: expected 'direct' or 'bounce1', got {component!r}")
     if blockers not in ("surface", "rsm"):
         raise ValueError(f"blockers: expected 'surface' or 'rsm', got {blockers!r}")
+    if blocking is not None and len(blocking) != len(config.grids(grid)):
+        raise ValueError(f"blocking: expected that of {len(config.grids(grid))} grid(s), got {len(blocking)}")
     raycaster = Raycaster(scene)
     emitters = emitters_of(scene, area_samples=area_samples, seed=seed, dtype=dtype, device=device)
     samples, visible = None, None
@@ -272,9 +278,10 @@ def illuminate(
         )
         return Blockers(s.position, s.normal, s.area), True
 
-    blocking = tuple(
-        blocking_of(scene, level, config, raycaster, surfels, dtype=dtype, device=device) for level in config.grids(grid)
-    )
+    if blocking is None:
+        blocking = tuple(
+            blocking_of(scene, level, config, raycaster, surfels, dtype=dtype, device=device) for level in config.grids(grid)
+        )
     if component == "direct":
         rsms = ()
     return Illumination(component, scene, grid, config, emitters, samples, visible, rsms, blocking, raycaster)

@@ -95,7 +95,7 @@ LAYERS: tuple[tuple[str, tuple[str, ...]], ...] = (
         ),
     ),
     ("report", ("difflpv.report",)),
-    ("demo", ("difflpv.demo", "difflpv.stress")),
+    ("demo", ("difflpv.bench", "difflpv.demo", "difflpv.stress")),
     ("cli", ("difflpv.cli",)),
     ("scripts", ("scripts",)),
 )
@@ -147,7 +147,7 @@ ONLY = (
 )
 
 # Only these parts may know the path tracer: what they judge must not.
-DATA_GEN_USERS = ("data_gen", "difflpv.cli", "difflpv.demo", "difflpv.stress", "difflpv.training", "scripts")
+DATA_GEN_USERS = ("data_gen", "difflpv.bench", "difflpv.cli", "difflpv.demo", "difflpv.stress", "difflpv.training", "scripts")
 
 LIBRARY_OWNERS: dict[str, tuple[str, ...]] = {
     "warp": ("warp_kernels", "difflpv.bridge", "difflpv.face_propagation"),

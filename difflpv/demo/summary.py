@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from data_gen.load import Targets
-from difflpv.evaluate import Score, format_scores, mean_score
+from difflpv.evaluate import Score, format_scores, mean_score, relative_noise
 
 __all__ = ["DemoSummary", "code_digest", "describe_machine", "describe_targets", "finished_summary", "mean_rows"]
 
@@ -112,11 +112,10 @@ def describe_targets(targets: Targets, train: Sequence[int], test: Sequence[int]
     """Size and cost of the targets, and their noise: the relative L2 error that a perfect prediction would show."""
     noise: dict[str, dict[str, float]] = {}
     for component in targets.components:
-        floors = []
-        for light in targets.lights:
-            weight = light.area_weight[:, None]
-            error, truth = light.standard_error[component], light.irradiance[component]
-            floors.append(float(np.sqrt((weight * error**2).sum() / (weight * truth**2).sum())))
+        floors = [
+            relative_noise(light.standard_error[component], light.irradiance[component], light.area_weight)
+            for light in targets.lights
+        ]
         noise[component] = {
             split: float(np.mean([floors[k] for k in lights])) for split, lights in (("train", train), ("test", test))
         }

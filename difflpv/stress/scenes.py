@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from data_gen.targets import make_targets
+from difflpv.evaluate import relative_noise
 from difflpv.grid import Grid
 from difflpv.io import load_scene
 from difflpv.scene import AreaLight, Material, Mesh, Scene
@@ -65,10 +66,7 @@ def traced_case(
     light, receivers = targets.lights[0], targets.receivers
     weight = light.area_weight.astype(float)
     truth = {c: light.irradiance[c].astype(float) for c in components}
-    noise = {}
-    for c in components:
-        variance = (weight[:, None] * light.standard_error[c].astype(float) ** 2).sum()
-        noise[c] = float(np.sqrt(variance / (weight[:, None] * truth[c] ** 2).sum()))
+    noise = {c: relative_noise(light.standard_error[c], truth[c], weight) for c in components}
     return Case(scene, receivers.position.astype(float), receivers.normal.astype(float), weight, truth, noise)
 
 
