@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ from difflpv.stencil import LinearStencil, pair_offsets
 from difflpv.stencil_coordinates import StencilCoordinates
 from difflpv.weighted import gather_lobes
 
-__all__ = ["Lpv"]
+__all__ = ["Lpv", "coarsen"]
 
 
 class Lpv(torch.nn.Module):
@@ -146,8 +147,22 @@ class Lpv(torch.nn.Module):
             ValueError: an illumination made for another grid, or without the occlusion that the configuration names.
             FloatingPointError: the result is not finite.
         """
+        return self.gather(self.accumulate(illumination, values), illumination, receivers, values)
+
+    def gather(
+        self,
+        volumes: Sequence[torch.Tensor],
+        illumination: Illumination,
+        receivers: Receivers,
+        values: Mapping[str, torch.Tensor] | None = None,
+    ) -> torch.Tensor:
+        """Irradiance [n,3] W/m2 of receivers: from the volumes of ``accumulate``, and from punctual lights by shadow rays.
+
+        Raises:
+            FloatingPointError: the result is not finite.
+        """
         v = self._complete(values, receivers.position)
-        irradiance = self.read(self.accumulate(illumination, values), receivers, values)
+        irradiance = self.read(volumes, receivers, values)
         direct = illumination.punctual_irradiance(receivers, _light_values(v))
         if direct is not None:
             irradiance = irradiance + direct
@@ -159,6 +174,36 @@ class Lpv(torch.nn.Module):
         self, illumination: Illumination, values: Mapping[str, torch.Tensor] | None = None
     ) -> tuple[torch.Tensor, ...]:
         """The solved volume [3, K, n_z, n_y, n_x] W/sr of each grid, finest first: shade, inject, occlude, propagate."""
+        volume, moved = self._start(illumination, values)
+        first, steps = self.config.fine_steps, self.config.steps
+        solved = moved(volume, 0, 0, first)
+        if first == steps:
+            return (solved,)
+        # what a step adds is what still moves: it is read where it goes on, in the coarse cells
+        before = moved(volume, 0, 0, first - 1)
+        return before, moved(coarsen(solved - before), 1, first, steps)
+
+    def moving(
+        self, illumination: Illumination, values: Mapping[str, torch.Tensor] | None = None
+    ) -> Iterator[torch.Tensor]:
+        """The light S_i [3, K, n_z, n_y, n_x] W/sr that moves after each step: S_0, the injected volume, to S_steps.
+
+        The volumes on each grid add up to what ``accumulate`` returns for it, where the configuration's ``tolerance`` is 0;
+        S_i with i >= ``config.fine_steps`` (where that is below ``config.steps``) is on the coarser grid.
+        """
+        light, moved = self._start(illumination, values)
+        first, steps = self.config.fine_steps, self.config.steps
+        yield light
+        for step in range(steps):
+            light = moved(light, int(step >= first), step, step + 1) - light
+            if step + 1 == first < steps:
+                light = coarsen(light)
+            yield light
+
+    def _start(
+        self, illumination: Illumination, values: Mapping[str, torch.Tensor] | None
+    ) -> tuple[torch.Tensor, Callable[[torch.Tensor, int, int, int], torch.Tensor]]:
+        """The injected volume, and ``moved(light, level, begin, end)``: the sum of light over steps on one of the grids."""
         if illumination.grid != self.grid:
             raise ValueError(f"illumination: expected one made for {self.grid}, got {illumination.grid}")
         config = self.config
@@ -173,7 +218,8 @@ class Lpv(torch.nn.Module):
         if self._coordinates is not None:
             z = self._merged(values)["stencil"]  # not in the precision of the light
             matrices = self._coordinates.matrices(z.cpu().double()).to(volume)
-        factors, first = v["propagation"] * v["propagation_steps"], config.fine_steps
+        factors = v["propagation"] * v["propagation_steps"]
+        passing = cache(lambda level: self._transmittance(illumination, level, v))
 
         def moved(light: torch.Tensor, level: int, begin: int, end: int) -> torch.Tensor:
             return propagate(
@@ -181,7 +227,7 @@ class Lpv(torch.nn.Module):
                 stencil,
                 steps=end - begin,
                 factor=factors[begin:end],
-                transmittance=self._transmittance(illumination, level, v),
+                transmittance=passing(level),
                 # without blockers only a field of the cells acts there, which is no self-shadowing
                 occlude_first_step=bool(config.occlude_first_step) or begin > 0 or config.occlusion == "none",
                 clamp=config.clamp,
@@ -190,12 +236,7 @@ class Lpv(torch.nn.Module):
                 checkpoint_every=self.checkpoint_every,
             )
 
-        solved = moved(volume, 0, 0, first)
-        if first == config.steps:
-            return (solved,)
-        # what a step adds is what still moves: it is read where it goes on, in the coarse cells
-        before = moved(volume, 0, 0, first - 1)
-        return before, moved(coarsen(solved - before), 1, first, config.steps)
+        return volume, moved
 
     def _transmittance(
         self, illumination: Illumination, level: int, v: Mapping[str, torch.Tensor]

@@ -32,13 +32,16 @@ class Hits:
 
 
 class Raycaster:
-    """Embree acceleration structure over a scene's triangles (built once, float32)."""
+    """Embree acceleration structure over triangles (built once, float32)."""
 
-    def __init__(self, scene: Scene) -> None:
-        corners = np.ascontiguousarray(scene.triangle_vertices, np.float32)
+    def __init__(self, scene: Scene | np.ndarray) -> None:
+        """Build it over a scene, or over the corners [T,3,3] m of any triangles, at least one."""
+        triangles = scene.triangle_vertices if isinstance(scene, Scene) else scene
+        corners = np.ascontiguousarray(triangles, np.float32)
         self._scene = rtcore_scene.EmbreeScene()
         self._mesh = TriangleMesh(self._scene, corners)
-        low, high = scene.bounds
+        points = triangles.reshape(-1, 3)
+        low, high = points.min(0), points.max(0)
         extent = max(float((high - low).max()), float(np.abs([low, high]).max()))
         self.offset = 2e-5 * extent  # about 170 float32 ulps at the scene's far corner
         self.triangle_count = len(corners)

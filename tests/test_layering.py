@@ -36,6 +36,7 @@ LAYERS: tuple[tuple[str, tuple[str, ...]], ...] = (
             "difflpv.raycast",
             "difflpv.scene",
             "difflpv.sh",
+            "difflpv.shapes",
         ),
     ),
     ("bridge", ("difflpv.bridge", "difflpv.coordinates", "difflpv.vpl")),
@@ -95,7 +96,7 @@ LAYERS: tuple[tuple[str, tuple[str, ...]], ...] = (
         ),
     ),
     ("report", ("difflpv.report",)),
-    ("demo", ("difflpv.bench", "difflpv.demo", "difflpv.stress")),
+    ("demo", ("difflpv.bench", "difflpv.demo", "difflpv.stress", "difflpv.viewer")),
     ("cli", ("difflpv.cli",)),
     ("scripts", ("scripts",)),
 )
@@ -161,6 +162,7 @@ LIBRARY_OWNERS: dict[str, tuple[str, ...]] = {
     "safetensors": ("difflpv.fitted", "difflpv.probes.probe_files", "difflpv.stencil_files"),
     "matplotlib": ("difflpv.report", "scripts"),
     "tqdm": ("data_gen", "difflpv.cli", "scripts"),
+    "viser": ("difflpv.viewer.page",),
     "mitsuba": (),
 }
 

@@ -145,6 +145,29 @@ def test_two_cell_sizes_without_steps_left_are_one():
         Lpv(GRID, LpvConfig(method="learned_4x6", steps=3, coarsen_after=2), learn=["cell_propagation"])
 
 
+@pytest.mark.parametrize(
+    "config",
+    [
+        LpvConfig(method="lpv", steps=5),
+        LpvConfig(steps=4, occlusion="exp", occlude_first_step=False),
+        LpvConfig(method="learned_9x6", steps=5),
+        LpvConfig(method="learned_9x6", steps=5, coarsen_after=2),
+        LpvConfig(steps=4, occlusion="clamp", coarsen_after=3),
+        LpvConfig(steps=0),
+    ],
+    ids=lambda c: f"{c.method}-{c.occlusion}-{c.coarsen_after}-{c.steps}",
+)
+def test_what_moves_in_each_step_adds_up_to_the_solve(config):
+    lpv, light, _ = solved(config)
+    values = {"propagation": torch.tensor(0.9, dtype=torch.float64), "occlusion": torch.tensor(0.6, dtype=torch.float64)}
+    moving = list(lpv.moving(light, values))
+    assert len(moving) == config.steps + 1
+    torch.testing.assert_close(moving[0], solved(LpvConfig(**{**config.to_json(), "steps": 0}))[0].accumulate(light)[0])
+    for volume in lpv.accumulate(light, values):
+        parts = [m for m in moving if m.shape == volume.shape]
+        torch.testing.assert_close(torch.stack(parts).sum(0), volume, rtol=1e-4, atol=1e-6 * float(volume.abs().max()))
+
+
 def test_a_symmetric_room_stays_symmetric_where_walls_lie_on_coarse_centres():
     """An even grid around a box puts two walls on planes of coarse cell centres, and two not: all four read the same."""
     scene = box_scene([PointLight(np.zeros(3), np.ones(3))])

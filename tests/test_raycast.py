@@ -123,3 +123,9 @@ def test_offset_follows_the_extent(scale):
     assert Raycaster(scene_of((corners.reshape(-1, 3), np.arange(15).reshape(-1, 3)))).offset == pytest.approx(
         2e-5 * max(np.ptp(corners.reshape(-1, 3), axis=0).max(), np.abs(corners).max())
     )
+
+
+def test_corners_alone_are_enough():
+    corners = np.array([[[0.0, 0, 1], [4, 0, 1], [0, 4, 1]]])
+    hits = Raycaster(corners).closest(np.array([[1.0, 1, 0], [9, 9, 0]]), np.array([[0.0, 0, 1]] * 2))
+    assert hits.valid.tolist() == [True, False] and hits.distance[0] == pytest.approx(1.0)

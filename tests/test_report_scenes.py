@@ -1,0 +1,90 @@
+"""Figures of scenes: what is where in them, and how large."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from difflpv.grid import Grid
+from difflpv.io import load_scene
+from difflpv.probes.probe_set import ProbeSet
+from difflpv.report.picture import axis_camera, picture
+from difflpv.report.scene_figures import LobeSlice, lobe_picture, probe_figure, probe_picture
+from difflpv.scene import Camera
+from difflpv.sh import cosine_lobe
+from difflpv.shapes.shape import Shape
+from difflpv.shapes.spheres import sphere_normals, sphere_shape
+
+LOW, HIGH = np.array([-1.0, 0, 2]), np.array([3.0, 2, 5])
+
+
+def ball(center, radius, color=(1.0, 0, 0), detail=3):
+    count = len(sphere_normals(detail))
+    return sphere_shape(np.array([center], float), radius, np.broadcast_to(color, (1, count, 3)))
+
+
+def test_a_ball_has_the_size_of_its_projection():
+    camera = Camera(np.eye(4), np.pi / 2, width=200, height=200)
+    image = picture(ball((0, 0, -4), 1.0), camera, width=200, background=(0, 0, 0), samples=2)
+    seen = image[..., 0].sum() / 200**2
+    tangent = 1 / np.sqrt(4**2 - 1)  # of the angle of the cone that touches the ball; the image is 2 wide at distance 1
+    assert seen == pytest.approx(np.pi * tangent**2 / 4, rel=0.02)
+    assert not image[..., 1:].any()
+
+
+def test_backs_are_not_seen():
+    camera = Camera(np.eye(4), np.pi / 2, width=20, height=20)
+    inside = ball((0, 0, 0), 1.0)
+    assert np.allclose(picture(inside, camera, width=20), 1.0), "from within all fronts face away"
+    turned = Shape(inside.vertices, inside.triangles[:, ::-1], inside.color)
+    assert np.allclose(picture(turned, camera, width=20), [1.0, 0, 0])
+
+
+@pytest.mark.parametrize(("axis", "right", "up"), [(0, -2, 1), (1, 0, -2), (2, 0, 1)])
+def test_a_plan_is_framed_by_its_box_and_turned_as_said(axis, right, up):
+    """A dot near the corner that is said to be right and up lies there, in the plane of the slice."""
+    height = float((LOW + HIGH)[axis] / 2)
+    camera = axis_camera(LOW, HIGH, axis, height)
+    spot = (LOW + HIGH) / 2
+    for direction in (right, up):
+        a = abs(direction)
+        sign = -1 if direction < 0 else 1
+        spot[a] += sign * 0.45 * (HIGH - LOW)[a]
+    image = picture(ball(spot, 0.02, (0, 0, 0)), camera, width=200)
+    y, x = np.argwhere(image.mean(2) < 0.5).mean(0)
+    assert x / image.shape[1] == pytest.approx(0.95, abs=0.01) and y / image.shape[0] == pytest.approx(0.05, abs=0.01)
+
+
+def test_probes_are_lit_from_where_their_light_comes(tmp_path):
+    scene = load_scene("cornell")
+    radiance = np.zeros((2, 9, 3))
+    radiance[0] = cosine_lobe(np.array([0.0, 1, 0]), 2)[:, None] * [0.2, 1.0, 0.2]  # green from above
+    radiance[1] = cosine_lobe(np.array([0.0, -1, 0]), 2)[:, None] * [0.2, 0.2, 1.0]  # blue from below
+    probes = ProbeSet(np.array([[-1.0, 4.2, 1.0], [1.0, 4.2, 1.0]]), radiance)
+    image = probe_picture(scene, probes, width=320)
+    empty = probe_picture(scene, ProbeSet(np.zeros((0, 3)), np.zeros((0, 9, 3))), width=320)
+    y, x = np.argwhere(np.abs(image - empty).max(2) > 0.02).T
+    left, right = x < 160, x > 160
+    assert left.sum() > 100 and right.sum() > 100
+    for side, channel, above in ((left, 1, True), (right, 2, False)):
+        ys, color = y[side], image[y[side], x[side]]
+        upper, lower = color[ys < ys.mean()].mean(0), color[ys > ys.mean()].mean(0)
+        bright, dark = (upper, lower) if above else (lower, upper)
+        assert bright[channel] > 2 * dark[channel] and bright.argmax() == channel
+    edges = np.array([probes.position])
+    probe_figure(scene, probes, tmp_path / "probes.png", edges=edges)
+    with Image.open(tmp_path / "probes.png") as shown:
+        assert shown.size[0] > 400
+    joined = probe_picture(scene, probes, edges=edges, width=320)
+    assert (np.abs(joined - image).max(2) > 0.02).sum() > 30, "the edge between them is drawn"
+
+
+def test_a_slice_points_where_its_light_goes():
+    scene = load_scene("cornell")
+    grid = Grid((-3, -0.25, -3), 2.0, (3, 3, 3))
+    coeffs = cosine_lobe(np.array([[1.0, 0, 0]]), 2)[:, :, None] * np.ones(3)
+    layer = LobeSlice(np.array([[0.0, 2.75, 0]]), coeffs, grid, 2, 0.0)
+    plain = lobe_picture(scene, LobeSlice(np.zeros((0, 3)), np.zeros((0, 9, 3)), grid, 2, 0.0), width=200)
+    changed = np.abs(lobe_picture(scene, layer, width=200) - plain).max(2) > 0.05
+    y, x = np.argwhere(changed).T
+    assert x.mean() > 100 + 10 and abs(y.mean() - changed.shape[0] / 2) < 3
+    assert plain.min() < 0.05, "the walls are outlined"
