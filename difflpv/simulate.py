@@ -15,7 +15,7 @@ from difflpv.pipeline import Lpv
 from difflpv.scene import Camera, Scene
 from difflpv.trouble import describe_trouble
 
-__all__ = ["Prediction", "render", "simulate", "solve_irradiance"]
+__all__ = ["Prediction", "read_volume", "render", "simulate", "solve_irradiance"]
 
 _RECEIVERS_PER_CHUNK = 1 << 18
 
@@ -41,6 +41,27 @@ def solve_irradiance(lpv: Lpv, light: Illumination, position: np.ndarray, normal
         parts.append(lpv(light, light.receivers(position[rows], normal[rows])).cpu().numpy())
     irradiance = np.concatenate(parts).astype(np.float64)
     return Prediction(irradiance, describe_trouble(lpv, light, position, normal, irradiance))
+
+
+@torch.no_grad()
+def read_volume(volume: np.ndarray, light: Illumination, position: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Irradiance [n,3] W/m2 of receivers from a volume of degree 2 that was not solved for, such as the true one.
+
+    Args:
+        volume: accumulated intensity [W/sr], shape [3, 9, n_z, n_y, n_x], on the finest grid of ``light``.
+        light: whose configuration names the lookup, and whose punctual lights add their direct light.
+        position: receivers [n,3] m.
+        normal: unit normals [n,3].
+    """
+    lpv = Lpv(light.grid, LpvConfig(method="holpv", lookup=light.config.lookup))
+    parts = []
+    for begin in range(0, max(len(position), 1), _RECEIVERS_PER_CHUNK):
+        rows = slice(begin, begin + _RECEIVERS_PER_CHUNK)
+        receivers = light.receivers(position[rows], normal[rows])
+        irradiance = lpv.read((torch.as_tensor(volume).to(receivers.position),), receivers)
+        exact = light.punctual_irradiance(receivers)
+        parts.append((irradiance if exact is None else irradiance + exact).cpu().numpy())
+    return np.concatenate(parts).astype(np.float64)
 
 
 def simulate(

@@ -261,3 +261,18 @@ def test_evaluate_as_text(room, capsys):
     weight, direct = truth.area_weight[:, None], truth.irradiance["direct"]
     error = np.sqrt((weight * (direct - mean) ** 2).sum() / (weight * direct**2).sum())
     assert f"{error:.3f}" in lines[2]
+
+
+def test_tables_show_the_floor_once_it_is_known(room, capsys):
+    scene, targets = room / "room.glb", room / "targets"
+    some = ["evaluate", scene, "--targets", targets, "--light", 1, "--component", "bounce1"]
+    assert difflpv(*some, "--method", "floor", "--spp", 1024) == 0
+    floor = capsys.readouterr().out.splitlines()[-1]
+    assert floor.split()[0] == "floor"
+    assert difflpv(*some, "--method", "learned_9x26") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines[2:]] == ["constant", "learned_9x26", "floor"]
+    assert lines[-1].split() == floor.split()  # the same lookup, the same numbers
+    assert difflpv(*some, "--method", "learned_9x26", "--grid", 6) == 0
+    assert "floor" not in capsys.readouterr().out  # of other cells
+    assert load_targets(targets)  # still sound

@@ -19,7 +19,7 @@ from difflpv.learnables import LEARNABLES
 
 def test_choices_are_those_of_the_functions():
     """The commands name them without importing torch; here they are compared."""
-    assert set(options.METHODS) == {*METHODS, "constant"}
+    assert set(options.METHODS) == {*METHODS, "constant", "floor"}
     assert options.COMPONENTS == Component.__args__
     assert fit_command.LEARNABLES == LEARNABLES
     assert fit_command.LOSSES == Loss.__args__

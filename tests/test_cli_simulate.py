@@ -7,6 +7,7 @@ import pytest
 from cli_room import difflpv, make_targets, write_room
 from PIL import Image
 
+from data_gen.cells import true_volume
 from data_gen.load import load_targets
 from difflpv.config import LpvConfig, grid_for
 from difflpv.illumination import illuminate
@@ -15,7 +16,7 @@ from difflpv.io.exr import read_exr
 from difflpv.io.tables import load_receivers, load_table, save_table
 from difflpv.lights import apply_light_set, load_light_sets
 from difflpv.pipeline import Lpv
-from difflpv.simulate import render, simulate
+from difflpv.simulate import read_volume, render, simulate
 
 
 @pytest.fixture(scope="module")
@@ -134,6 +135,33 @@ def test_constant_is_the_weighted_mean_of_the_targets(room, table, tmp_path, cap
     assert [s["scale"] for s in content["scores"]] == [pytest.approx(1)]
 
 
+def test_the_floor_reads_the_true_light_and_keeps_it(room, table, tmp_path, capsys, monkeypatch):
+    """One command path-traces it beside the output; another lookup, an image and tables of other methods find it again."""
+    command = ["simulate", room / "room.glb", "--method", "floor", "--component", "direct", "--lights", room / "sets.json",
+               "--light", 1, "--receivers", table, "--out", tmp_path / "f.npz"]  # fmt: skip
+    content, err = run_json(capsys, *command, "--spp", 2048)
+    scene, asked = load_scene(room / "room.glb"), load_receivers(table)
+    lit = apply_light_set(scene, load_light_sets(room / "sets.json", "room")[1])
+    volume = true_volume(lit, grid_for(scene), "direct", spp=2048)
+    light = illuminate(lit, grid_for(scene), LpvConfig(lookup="affine"), "direct")
+    expected = read_volume(volume, light, asked.position, asked.normal)
+    np.testing.assert_allclose(load_table(tmp_path / "f.npz")["irradiance"], expected, rtol=1e-4, atol=1e-4)
+    constant, floor = content["scores"]
+    assert floor["method"] == "floor" and floor["relative_l2"] < 0.6 * constant["relative_l2"]
+    assert len(list((tmp_path / "floor").iterdir())) == 1
+    monkeypatch.setattr("data_gen.cells.trace_volume", None)
+    other, _ = run_json(capsys, *command, "--lookup", "trilinear")
+    assert other["scores"][1]["relative_l2"] != floor["relative_l2"]
+    render = ["render", *command[1:8], "--out", tmp_path / "image.exr"]
+    assert difflpv(*render, "--light", 1) == 0 and read_exr(tmp_path / "image.exr")[0]["R"].max() > 0
+
+
+def test_noise_of_the_floor_is_told(room, table, tmp_path, capsys):
+    command = ["simulate", room / "room.glb", "--method", "floor", "--receivers", table, "--out", tmp_path / "f.npz"]
+    content, err = run_json(capsys, *command, "--spp", 32)
+    assert "floor: 32 paths per cell leave a noise of" in content["warnings"][0] and "--spp" in err
+
+
 def test_lost_light_is_told(tmp_path, table, capsys):
     """A grid that ends inside the room: the share of lost VPLs, and the receivers outside."""
     scene = write_room(tmp_path, "cut", grid_low=(0.0, -1.5, -0.6))
@@ -174,6 +202,8 @@ def test_an_image_of_the_constant(room, tmp_path, capsys):
 BAD = {
     "method": (["--method", "radiosity"], "argument --method: invalid choice: 'radiosity'"),
     "steps": (["--steps", "-1"], "argument --steps: expected a whole number >= 0, got '-1'"),
+    "spp": (["--spp", "64"], "--spp: only --method floor traces paths, got --method holpv"),
+    "floor": (["--method", "floor", "--steps", "4"], "--steps: --method floor solves nothing, only --grid, --lookup and"),
     "grid": (["--grid", "2"], "grid: expected at least 3 cells, got 2"),
     "lights": (["--lights", "SETS"], "--lights: choose one of the 4 light sets with --light 0..3"),
     "light": (["--lights", "SETS", "--light", "4"], "--light: 4 is out of range, SETS has 4 light sets (0-3)"),

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from difflpv.cli.floor import add_floor, check_floor, floor_folder, floor_of, known_floor
 from difflpv.cli.options import (
     COMPONENTS,
     UsageError,
@@ -38,9 +39,12 @@ def add_parser(subparsers: Any) -> None:
         run,
         help="errors against targets, per component and light",
         description="Relative L2 error, the same at the best single scale, mean and 95th percentile error, weighted by area, "
-        "per component and light and their means, with the constant beside it; for a fitted model the untuned one too.",
+        "per component and light and their means, with the constant beside it; for a fitted model the untuned one too. Once "
+        "--method floor has path-traced the true light in the cells, every table of these targets and this grid shows it: what "
+        "a perfect propagation could do, read by the method's own lookup.",
         example="""
         difflpv evaluate cornell --method lpv --targets out/targets
+        difflpv evaluate cornell --method floor --targets out/targets
         difflpv evaluate cornell --fitted out/fit --targets out/targets --component bounce1 --light 5-7
         """,
     )
@@ -50,6 +54,7 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument("--light", type=index_list, metavar="LIST", help="which lights of the targets, as 0-4,7 (default: all)")
     add_solve(parser)
+    add_floor(parser)
     add_device(parser)
     seeded(parser)
     add_output(parser)
@@ -70,6 +75,7 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("--light: expected at least one light")
     check_indices("--light", lights, len(targets.lights), str(args.targets))
     solve = solve_from(args, scene)
+    check_floor(args, solve)
     device = select_device(args.device) if solve.method != "constant" else None
     progress = Progress(quiet=args.json)
     scores: list[Score] = []
@@ -138,11 +144,19 @@ def _score_light(
     if device is not None:
         lit = apply_light_set(scene, light.entries)
         illumination = illuminate(lit, solve.grid, solve.config, component, seed=args.seed, device=device)
-        models = {solve.method: Lpv(solve.grid, solve.config)}
-        if solve.record is not None:
-            models[solve.label] = solve.model(lit)
-        for name, lpv in models.items():
-            prediction = solve_irradiance(lpv, illumination, targets.receivers.position, targets.receivers.normal)
-            predictions[name], told = prediction.irradiance, prediction.warnings
+        x, n = targets.receivers.position, targets.receivers.normal
+        if solve.method == "floor":
+            prediction = floor_of(args, illumination, x, n)
+            predictions["floor"], told = prediction.irradiance, prediction.warnings
+        else:
+            models = {solve.method: Lpv(solve.grid, solve.config)}
+            if solve.record is not None:
+                models[solve.label] = solve.model(lit)
+            for name, lpv in models.items():
+                prediction = solve_irradiance(lpv, illumination, x, n)
+                predictions[name], told = prediction.irradiance, prediction.warnings
+            floor = known_floor(floor_folder(args), illumination, x, n)
+            if floor is not None:
+                predictions["floor"], told = floor.irradiance, (*told, *floor.warnings)
     rows = [score(p, truth, weight, method=name, component=component, light=k) for name, p in predictions.items()]
     return rows, told

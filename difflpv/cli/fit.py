@@ -102,7 +102,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--seconds", type=positive_float, metavar="S", help="wall-time limit (default: none)")
     parser.add_argument("--lr", type=positive_float, metavar="X", help="step size of --solver adam (default: 0.05)")
     parser.add_argument("--overwrite", action="store_true", help="start anew instead of going on from DIR's checkpoint")
-    add_solve(parser, methods=tuple(name for name in METHODS if name != "constant"), fitted=False)
+    add_solve(parser, methods=tuple(name for name in METHODS if name not in ("constant", "floor")), fitted=False)
     add_device(parser)
     seeded(parser)
     add_output(parser)

@@ -43,7 +43,7 @@ __all__ = [
 
 COMPONENTS = ("direct", "bounce1")
 LEARNED = ("learned_4x6", "learned_9x6", "learned_4x26", "learned_9x26", "learned_16x26")
-METHODS = ("lpv", "holpv", *LEARNED, "constant")
+METHODS = ("lpv", "holpv", *LEARNED, "constant", "floor")
 
 
 class UsageError(ValueError):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from difflpv.cli.floor import add_floor, check_floor, floor_of
 from difflpv.cli.options import (
     COMPONENTS,
     UsageError,
@@ -23,7 +24,7 @@ from difflpv.cli.options import (
     select_device,
 )
 from difflpv.cli.output import make_folder, print_json, warn
-from difflpv.cli.simulate import add_constant, constant_irradiance
+from difflpv.cli.simulate import add_constant, check_targets, constant_irradiance
 from difflpv.cli.solve import Solve, add_solve, describe_solve, solve_from
 
 if TYPE_CHECKING:
@@ -54,6 +55,7 @@ def add_parser(subparsers: Any) -> None:
     )
     add_solve(parser)
     add_constant(parser)
+    add_floor(parser)
     add_lights(parser)
     add_device(parser)
     seeded(parser)
@@ -76,6 +78,7 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"--camera: {args.camera} is out of range, scene '{scene.name}' has {len(scene.cameras)} camera(s)")
     camera = scene.cameras[args.camera]
     solve = solve_from(args, scene)
+    check_floor(args, solve)
     images, told = _images(args, scene, solve, camera)
     warnings = [*scene.warnings, *told]
     warn(warnings)
@@ -132,12 +135,17 @@ def _images(
             irradiance = np.broadcast_to(constant_irradiance(args, scene, component), view.position.shape)
             images[component] = view.image(irradiance, emission=component == "direct")
         return images, told
-    if args.targets is not None:
-        raise UsageError("--targets: only --method constant takes its mean from targets")
+    check_targets(args, solve)
     device = select_device(args.device)
     lit = chosen_light(args, scene)
     for component in components:
         light = illuminate(lit, solve.grid, solve.config, component, seed=args.seed, device=device)
+        if solve.method == "floor":
+            view = camera_view(lit, light.raycaster, camera)
+            floor = floor_of(args, light, view.position, view.normal)
+            images[component] = view.image(floor.irradiance, emission=component == "direct")
+            told += floor.warnings
+            continue
         images[component], warnings = render(solve.model(lit), light, camera)
         told += warnings
     return images, told

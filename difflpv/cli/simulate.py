@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from difflpv.cli.floor import add_floor, check_floor, floor_of
 from difflpv.cli.options import (
     COMPONENTS,
     UsageError,
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from difflpv.scene import Scene
     from difflpv.simulate import Prediction
 
-__all__ = ["add_constant", "add_parser", "constant_irradiance", "run"]
+__all__ = ["add_constant", "add_parser", "check_targets", "constant_irradiance", "run"]
 
 
 def add_parser(subparsers: Any) -> None:
@@ -57,6 +58,7 @@ def add_parser(subparsers: Any) -> None:
     )
     add_solve(parser)
     add_constant(parser)
+    add_floor(parser)
     add_lights(parser)
     add_device(parser)
     seeded(parser)
@@ -66,8 +68,15 @@ def add_parser(subparsers: Any) -> None:
 def add_constant(parser: Any) -> None:
     """``--targets`` of ``--method constant``."""
     parser.add_argument(
-        "--targets", type=Path, metavar="DIR", help="for --method constant: targets whose mean it predicts (light --light)"
+        "--targets", type=Path, metavar="DIR", help="for --method constant: targets whose mean it predicts (light "
+        "--light); for --method floor: the true volume is kept there (default: beside --out)"
     )
+
+
+def check_targets(args: argparse.Namespace, solve: Solve) -> None:
+    """A ``UsageError`` for ``--targets`` of a method that has no use for them."""
+    if args.targets is not None and solve.method != "floor":
+        raise UsageError("--targets: only --method constant takes its mean from targets, and floor keeps its volume there")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -83,6 +92,7 @@ def run(args: argparse.Namespace) -> int:
     table = load_receivers(args.receivers)
     has_weight = "area_weight" in load_table(args.receivers)
     solve = solve_from(args, scene)
+    check_floor(args, solve)
     prediction = _predict(args, scene, solve, table)
     warnings = [*scene.warnings, *prediction.warnings]
     warn(warnings)
@@ -121,15 +131,18 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _predict(args: argparse.Namespace, scene: Scene, solve: Solve, table: ReceiverTable) -> Prediction:
+    from difflpv.illumination import illuminate
     from difflpv.simulate import Prediction, simulate
 
     if solve.method == "constant":
         mean = constant_irradiance(args, scene, args.component)
         return Prediction(np.broadcast_to(mean, table.position.shape).copy())
-    if args.targets is not None:
-        raise UsageError("--targets: only --method constant takes its mean from targets")
+    check_targets(args, solve)
     device = select_device(args.device)
     lit = chosen_light(args, scene)
+    if solve.method == "floor":
+        light = illuminate(lit, solve.grid, solve.config, args.component, seed=args.seed, device=device)
+        return floor_of(args, light, table.position, table.normal)
     return simulate(
         lit,
         table.position,

@@ -35,6 +35,7 @@ def add_solve(parser: Any, *, methods: tuple[str, ...] = METHODS, fitted: bool =
         choices=methods,
         help="lpv: 30 faces, 4 coefficients; holpv: 54 faces, 9 coefficients; learned_KxN: K coefficients, N neighbours"
         + ("; constant: the targets' mean" if "constant" in methods else "")
+        + ("; floor: the true light in the cells, path-traced" if "floor" in methods else "")
         + " (default: holpv)",
     )
     group.add_argument(
@@ -51,7 +52,7 @@ def add_solve(parser: Any, *, methods: tuple[str, ...] = METHODS, fitted: bool =
         "--lookup",
         choices=("trilinear", "damped", "front", "visible", "affine"),
         help="cells a receiver may read: all eight (damped: as the HOLPV thesis), those before its plane, those in its sight, "
-        "an affine fit to 27 in its sight (default: affine for learned_KxN, else trilinear)",
+        "an affine fit to 27 in its sight (default: affine for learned_KxN and floor, else trilinear)",
     )
     group.add_argument(
         "--normalization", choices=("energy", "thesis"), help="energy keeps the flux, thesis a quarter (default: energy)"
@@ -94,8 +95,8 @@ class Solve:
     """What is to be solved, and by which model.
 
     Attributes:
-        method: of the volume, or "constant".
-        config: of the volume; of HOLPV for "constant", which does not use it.
+        method: of the volume, "constant", or "floor".
+        config: of the volume; of HOLPV for "constant", which does not use it, and "floor", which uses its lookup.
         grid: cells.
         record: the fitted model's file, or None.
         folder: where that lies, or None.
@@ -136,9 +137,15 @@ def solve_from(args: argparse.Namespace, scene: Scene, **defaults: Any) -> Solve
     if folder is not None:
         return _fitted(args, scene, folder, given)
     method = given.get("method", "holpv")
+    if method == "floor":
+        for name in sorted(given.keys() - {"method", "lookup"}):
+            option = _option(name, given[name])
+            raise UsageError(f"{option}: --method floor solves nothing, only --grid, --lookup and --spp count")
+        defaults |= {"lookup": "affine"}
     with usage_errors():
         grid = grid_for(scene, args.grid)
-        volume = {k: v for k, v in given.items() if k != "method"} | ({} if method == "constant" else {"method": method})
+        volume = {k: v for k, v in given.items() if k != "method"}
+        volume |= {} if method in ("constant", "floor") else {"method": method}
         config = LpvConfig(**(defaults | volume))
     return Solve(method, config, grid)
 
@@ -151,9 +158,8 @@ def _fitted(args: argparse.Namespace, scene: Scene, folder: Path, given: dict[st
     for name, value in given.items():
         fixed = getattr(record.config, name)
         if value != fixed:
-            option = "--no-clamp" if name == "clamp" else "--" + ("no-" if value is False else "") + name.replace("_", "-")
             shown = "" if isinstance(value, bool) else f" {value}"
-            raise UsageError(f"{option}{shown}: the fitted model in {folder} has {name} {fixed}")
+            raise UsageError(f"{_option(name, value)}{shown}: the fitted model in {folder} has {name} {fixed}")
     grid = record.grid
     made_for = record.provenance.get("scene")
     same_scene = isinstance(made_for, dict) and made_for.get("hash") == scene.hash
@@ -166,12 +172,19 @@ def _fitted(args: argparse.Namespace, scene: Scene, folder: Path, given: dict[st
     return Solve(record.config.method, record.config, grid, record, folder)
 
 
+def _option(name: str, value: Any) -> str:
+    """The option that sets a field of the configuration."""
+    return "--no-clamp" if name == "clamp" else "--" + ("no-" if value is False else "") + name.replace("_", "-")
+
+
 def describe_solve(solve: Solve) -> str:
     """One line for people."""
     if solve.method == "constant":
         return "constant: the area-weighted mean of the targets"
     config, grid = solve.config, solve.grid
     cells = " x ".join(str(n) for n in grid.resolution)
+    if solve.method == "floor":
+        return f"floor: the true light in the cells, {cells} of {grid.cell_size:.4g} m, lookup {config.lookup}"
     parts = [
         solve.label,
         f"grid {cells} cells of {grid.cell_size:.4g} m",
