@@ -5,6 +5,7 @@ Volumes are kept only where the clamp or a learnable of the propagation needs th
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 import torch
 
 from difflpv.bridge import as_warp, refuse_second_derivative, warp_scalar
-from difflpv.padded import Layout, SlabLauncher, kept_volumes, march, steps_back, volumes_between
+from difflpv.padded import Layout, SlabLauncher, Spans, kept_volumes, march, steps_back, volumes_between
 from difflpv.stencil import FaceStencil
 from warp_kernels.propagation import CPU_LANES, adjoint_kernel, forward_kernel
 
@@ -45,7 +46,7 @@ class _Steps:
         self._offsets, self._order, self._transmittance = cells, topology["face"], transmittance.detach()
         self._tensors = {k: v.detach().contiguous().reshape(-1) for k, v in tensors.items()}  # keeps them alive
         self._views = {k: as_warp(v) for k, v in self._tensors.items()}
-        self._launcher = SlabLauncher(self.device)
+        self.launcher = SlabLauncher(self.device)
 
     @cached_property
     def _leaving(self) -> torch.Tensor:
@@ -72,13 +73,14 @@ class _Steps:
             "lanes": self.layout.lanes, "clamp": self.clamp, "occluded": self.occlude(step),
         }  # fmt: skip
 
-    def forward(self, moving: torch.Tensor, into: torch.Tensor, total: torch.Tensor, step: int) -> None:
+    def forward(self, moving: torch.Tensor, into: torch.Tensor, total: torch.Tensor, step: int, spans: Spans) -> None:
         """S_{step+1} from S_step, added onto ``total``; all flat padded buffers."""
         v, layout = self._views, self.layout
+        where = spans.arguments(moving, into)
         arguments = [
             as_warp(moving), as_warp(into), as_warp(total), as_warp(self._arriving), v["weights"], v["lobes"], v["factor"],
-            v["line_shift"], v["x_shift"], v["first"], v["face"], v["axis"], self.neighbours, self.faces, step, layout.y + 2,
-            layout.pitch, layout.channels // _group(layout), layout.z, layout.y, layout.x,
+            v["line_shift"], v["x_shift"], v["first"], v["face"], v["axis"], *where, self.neighbours, self.faces, step,
+            layout.y + 2, layout.pitch, layout.channels // _group(layout), layout.z, layout.y, layout.x,
         ]  # fmt: skip
         self._launch(forward_kernel(self._scalar, **self._spec(step)), arguments)
 
@@ -106,7 +108,7 @@ class _Steps:
         layout = self.layout
         rows, width = layout.z * layout.y, layout.x if self.device.type == "cuda" else 1
         for group in range(layout.channels // _group(layout)):
-            self._launcher.launch(kernel, rows, width, arguments, first=group * rows)
+            self.launcher.launch(kernel, rows, width, arguments, first=group * rows)
 
 
 def _group(layout: Layout) -> int:
@@ -122,15 +124,18 @@ def _rows(layout: Layout) -> int:
 def _propagate(
     volume: torch.Tensor, factors: torch.Tensor, transmittance: torch.Tensor, offsets: torch.Tensor, axis: torch.Tensor,
     weights: torch.Tensor, lobes: torch.Tensor, clamp: bool, occlude_first_step: bool, tolerance: float, keep: int,
+    read_box: Sequence[int],
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
     layout = Layout.of(volume, CPU_LANES)
     steps = _Steps(layout, factors, transmittance, offsets, axis, weights, lobes, clamp, occlude_first_step)
-    accumulated, states, done = march(layout, volume, len(factors), keep, tolerance, steps.forward)
-    return accumulated, states, torch.tensor(done)
+    spans = Spans(layout, volume, len(factors), read_box, groups=layout.channels // _group(layout))
+    total, states, done = march(layout, volume, len(factors), keep, tolerance, steps.forward, spans)
+    steps.launcher.release()
+    return layout.unpad(total), states, torch.tensor(done)
 
 
 @_propagate.register_fake
-def _(volume, factors, transmittance, offsets, axis, weights, lobes, clamp, occlude_first_step, tolerance, keep):
+def _(volume, factors, transmittance, offsets, axis, weights, lobes, clamp, occlude_first_step, tolerance, keep, read_box):
     layout = Layout.of(volume, CPU_LANES)
     states = kept_volumes(layout, volume, len(factors), keep)
     return torch.empty_like(volume, memory_format=torch.contiguous_format), states, torch.empty((), dtype=torch.int64)
@@ -162,7 +167,7 @@ def _propagate_backward(
         moving = total_bar if before is None else before
         steps.adjoint(moving, lobe_bar, lobe_bar_next, total_bar, volume_bar, transmittance_bar, factor_bar, step)
         lobe_bar, lobe_bar_next = lobe_bar_next, lobe_bar
-    volume_bar = layout.inside(volume_bar, fields).reshape(accumulated_bar.shape).contiguous()
+    volume_bar = layout.unpad(volume_bar)
     if faces:
         transmittance_bar = layout.inside(transmittance_bar, faces).contiguous()
     if need_factors:
@@ -189,7 +194,7 @@ def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[torch.Tensor, ...]) 
     _, states, done = output
     ctx.mark_non_differentiable(states, done)
     ctx.save_for_backward(states, done, factors, transmittance, offsets, axis, weights, lobes)
-    ctx.clamp, ctx.occlude_first_step, _, ctx.keep = flags
+    ctx.clamp, ctx.occlude_first_step, _, ctx.keep, _ = flags
 
 
 def _backward(ctx: Any, accumulated_bar: torch.Tensor, *unused: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
@@ -202,7 +207,7 @@ def _backward(ctx: Any, accumulated_bar: torch.Tensor, *unused: torch.Tensor) ->
         volume_bar if need_volume else None,
         factor_bar if need_factors else None,
         transmittance_bar if need_transmittance else None,
-        *[None] * 8,
+        *[None] * 9,
     )
 
 
@@ -219,6 +224,7 @@ def propagate_faces(
     clamp: bool,
     tolerance: float,
     checkpoint_every: int | None,
+    read_box: Sequence[int] = (),
 ) -> torch.Tensor:
     """``difflpv.propagation.propagate`` on the Warp kernels; arguments validated there, ``factors`` is [steps]."""
     passed = volume.new_ones((0, *volume.shape[2:])) if transmittance is None else transmittance
@@ -244,4 +250,5 @@ def propagate_faces(
         occlude_first_step,
         float(tolerance),
         keep,
+        list(read_box),
     )[0]

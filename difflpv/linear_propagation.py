@@ -6,6 +6,7 @@ transmittance learn: the step is linear in the light.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
@@ -13,7 +14,7 @@ import numpy as np
 import torch
 
 from difflpv.bridge import as_warp, refuse_second_derivative, warp_scalar
-from difflpv.padded import Layout, SlabLauncher, kept_volumes, march, steps_back, volumes_between
+from difflpv.padded import Layout, SlabLauncher, Spans, kept_volumes, march, steps_back, volumes_between
 from difflpv.stencil import pair_offsets
 from warp_kernels.linear_propagation import cpu_lanes, matrices_kernel, step_kernel
 
@@ -51,8 +52,9 @@ class _Steps:
             "x_shift": torch.tensor(np.ascontiguousarray(self.pairs[:, 0]), dtype=torch.int32, device=self.device),
         }  # fmt: skip
         self._views = {k: as_warp(v.reshape(-1)) for k, v in self._tensors.items()}
-        self._none = as_warp(factors.new_empty(0))
-        self._launcher = SlabLauncher(self.device)
+        self._none, no_ints = as_warp(factors.new_empty(0)), as_warp(torch.empty(0, dtype=torch.int32, device=self.device))
+        self._nowhere = [no_ints, no_ints, no_ints, self._none]
+        self.launcher = SlabLauncher(self.device)
 
     def _padded(self, transmittance: torch.Tensor) -> torch.Tensor:
         """Padded transmittance; 0 towards cells outside the grid, whatever stands there (a NaN would survive 0 S)."""
@@ -82,9 +84,10 @@ class _Steps:
             "coeffs": layout.coeffs, "lanes": layout.lanes, "occluded": self.occlude(step),
         }  # fmt: skip
 
-    def forward(self, moving: torch.Tensor, into: torch.Tensor, total: torch.Tensor, step: int) -> None:
+    def forward(self, moving: torch.Tensor, into: torch.Tensor, total: torch.Tensor, step: int, spans: Spans) -> None:
         """S_{step+1} from S_step, added onto ``total``; all flat padded buffers."""
-        self._step(moving, into, total, self._none, self._none, self._none, step, weights="weights")
+        where = spans.arguments(moving, into)
+        self._step(moving, into, total, self._none, self._none, self._none, step, where, weights="weights")
 
     def adjoint(
         self, after: torch.Tensor, into: torch.Tensor, total_bar: torch.Tensor, before: torch.Tensor | None,
@@ -97,20 +100,20 @@ class _Steps:
         }  # fmt: skip
         volume = self._none if before is None else as_warp(before)
         bars = as_warp(transmittance_bar), as_warp(factor_bar)
-        self._step(after, into, total_bar, volume, *bars, step, weights="adjoint weights", **flags)
+        self._step(after, into, total_bar, volume, *bars, step, self._nowhere, weights="adjoint weights", **flags)
 
     def _step(
         self, moving: torch.Tensor, into: torch.Tensor, total: torch.Tensor, before: Any, transmittance_bar: Any,
-        factor_bar: Any, step: int, *, weights: str, **flags: bool,
+        factor_bar: Any, step: int, where: list[Any], *, weights: str, **flags: bool,
     ) -> None:  # fmt: skip
         v, layout = self._views, self.layout
         kernel = step_kernel(self._scalar, **self._spec(step), paired=self.paired, **flags)
         arguments = [
             as_warp(moving), as_warp(into), as_warp(total), v["transmittance"], before, transmittance_bar, factor_bar,
-            v[weights], v["factor"], v["line_shift"], v["x_shift"], len(self.pairs), step, layout.y + 2, layout.pitch,
-            layout.channels, layout.z, layout.y, layout.x,
+            v[weights], v["factor"], v["line_shift"], v["x_shift"], *where, len(self.pairs), step, layout.y + 2,
+            layout.pitch, layout.channels, layout.z, layout.y, layout.x,
         ]  # fmt: skip
-        self._launcher.launch(kernel, layout.z * layout.y, self._width, arguments)
+        self.launcher.launch(kernel, layout.z * layout.y, self._width, arguments)
 
     def correlate(self, after: torch.Tensor, before: torch.Tensor, partial: torch.Tensor, step: int) -> None:
         """Add the matrices' gradient of one step onto ``partial`` [slabs, 1 + 2P, K, K]; ``after`` is G_{step+1}."""
@@ -120,7 +123,7 @@ class _Steps:
             as_warp(after), as_warp(before), v["transmittance"], as_warp(partial.view(-1)), v["factor"], v["line_shift"],
             v["x_shift"], len(self.pairs), step, layout.y + 2, layout.pitch, layout.channels, rows, layout.y, layout.x,
         ]  # fmt: skip
-        self._launcher.launch(matrices_kernel(self._scalar, **self._spec(step)), slabs, partial.shape[1], arguments)
+        self.launcher.launch(matrices_kernel(self._scalar, **self._spec(step)), slabs, partial.shape[1], arguments)
 
     def matrices_bar(self, partial: torch.Tensor) -> torch.Tensor:
         """Gradient of the matrices in the order of the offsets [n,K,K]."""
@@ -147,16 +150,18 @@ def _mirrored(weights: torch.Tensor) -> bool:
 @torch.library.custom_op("difflpv::propagate_pairs", mutates_args=())
 def _propagate(
     volume: torch.Tensor, matrices: torch.Tensor, factors: torch.Tensor, transmittance: torch.Tensor, offsets: torch.Tensor,
-    occlude_first_step: bool, tolerance: float, keep: int,
+    occlude_first_step: bool, tolerance: float, keep: int, read_box: Sequence[int],
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
     layout = _layout(volume)
     steps = _Steps(layout, matrices, factors, transmittance, offsets, occlude_first_step)
-    accumulated, states, done = march(layout, volume, len(factors), keep, tolerance, steps.forward)
-    return accumulated, states, torch.tensor(done)
+    spans = Spans(layout, volume, len(factors), read_box)
+    total, states, done = march(layout, volume, len(factors), keep, tolerance, steps.forward, spans)
+    steps.launcher.release()
+    return layout.unpad(total), states, torch.tensor(done)
 
 
 @_propagate.register_fake
-def _(volume, matrices, factors, transmittance, offsets, occlude_first_step, tolerance, keep):
+def _(volume, matrices, factors, transmittance, offsets, occlude_first_step, tolerance, keep, read_box):
     states = kept_volumes(_layout(volume), volume, len(factors), keep)
     return torch.empty_like(volume, memory_format=torch.contiguous_format), states, torch.empty((), dtype=torch.int64)
 
@@ -182,7 +187,7 @@ def _propagate_backward(
         steps.adjoint(after, into, source, before, passed_bar, factor_bar, step)
         after = into
     return (
-        layout.inside(after, layout.fields).reshape(total_bar.shape).contiguous(),
+        layout.unpad(after),
         steps.matrices_bar(partial) if need_matrices else total_bar.new_empty(0),
         factor_bar.view(len(factors), layout.z * layout.y).sum(1) if need_factors else total_bar.new_empty(0),
         steps.transmittance_bar(passed_bar) if pairs else total_bar.new_empty(0),
@@ -206,7 +211,7 @@ refuse_second_derivative("propagate", _propagate_backward)
 
 
 def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[torch.Tensor, ...]) -> None:
-    _, matrices, factors, transmittance, offsets, occlude_first_step, _, keep = inputs
+    _, matrices, factors, transmittance, offsets, occlude_first_step, _, keep, _ = inputs
     _, states, done = output
     ctx.mark_non_differentiable(states, done)
     ctx.save_for_backward(states, done, matrices, factors, transmittance, offsets)
@@ -216,7 +221,7 @@ def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[torch.Tensor, ...]) 
 def _backward(ctx: Any, total_bar: torch.Tensor, *unused: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
     needs = ctx.needs_input_grad[:4]
     bars = _propagate_backward(total_bar.contiguous(), *ctx.saved_tensors, ctx.occlude_first_step, ctx.keep, *needs[1:])
-    return (*(bar if need else None for bar, need in zip(bars, needs, strict=True)), *[None] * 4)
+    return (*(bar if need else None for bar, need in zip(bars, needs, strict=True)), *[None] * 5)
 
 
 _propagate.register_autograd(_backward, setup_context=_setup)
@@ -232,6 +237,7 @@ def propagate_pairs(
     occlude_first_step: bool,
     tolerance: float,
     checkpoint_every: int | None,
+    read_box: Sequence[int] = (),
 ) -> torch.Tensor:
     """``difflpv.propagation.propagate`` for a linear stencil on the Warp kernels; validated there, ``factors`` is [steps]."""
     passed = volume.new_ones((0, *volume.shape[2:])) if transmittance is None else transmittance
@@ -248,4 +254,5 @@ def propagate_pairs(
         occlude_first_step,
         float(tolerance),
         keep,
+        list(read_box),
     )[0]

@@ -6,26 +6,28 @@ bounds checks and may read ``lanes`` cells at once. (Rows that start on vector b
 memory than aligned access saves.)
 
 Adjoint of A = sum_i S_i with S_{i+1} = F_i(S_i): G_N = Abar, G_i = Abar + (dF_i/dS)^T G_{i+1}, and the volume's gradient
-is G_0. Volumes are kept only where that derivative or a learnable of the propagation needs them.
+is G_0. Volumes are kept only where that derivative or a learnable of the propagation needs them. Without any a solve holds
+three: the moving one, the next one, their sum.
+
+On the CPU a step leaves out cells that no light has reached and cells that can no longer reach what is read
+(``warp_kernels.row_spans``); ``Spans`` holds what it needs for that.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
+import numpy as np
 import torch
 
-from difflpv.bridge import record, replay
+from difflpv.bridge import as_warp, record, replay
 
-__all__ = ["Forward", "Layout", "SlabLauncher", "kept_volumes", "march", "steps_back", "volumes_between"]
-
-# S_{step+1} from S_step, added onto a total: (moving, into, total, step), all flat padded buffers.
-Forward = Callable[[torch.Tensor, torch.Tensor, torch.Tensor, int], None]
+__all__ = ["Forward", "Layout", "SlabLauncher", "Spans", "kept_volumes", "march", "steps_back", "volumes_between"]
 
 _KEEP_ALL_BYTES = 2**30
 
@@ -88,6 +90,61 @@ class Layout:
         self.inside(buffer, len(field)).copy_(field)
         return buffer
 
+    def unpad(self, buffer: torch.Tensor) -> torch.Tensor:
+        """Contiguous volume [C, K, n_z, n_y, n_x] of a flat buffer."""
+        inside = self.inside(buffer, self.fields).contiguous()
+        return inside.view(self.channels, self.coeffs, self.z, self.y, self.x)
+
+
+class Spans:
+    """Where light is in the buffers of one solve: spans of their rows, and the box that each step has to fill."""
+
+    def __init__(
+        self, layout: Layout, like: torch.Tensor, steps: int, read_box: Sequence[int] = (), *, groups: int = 1
+    ) -> None:
+        """Set up.
+
+        Args:
+            layout: of the buffers.
+            like: gives precision and device.
+            steps: of the solve.
+            read_box: cells that are read at the end, (z, y, x) as (begin, end) pairs; empty: all.
+            groups: channel groups that keep spans of their own.
+        """
+        size = np.array([layout.z, layout.y, layout.x])
+        box = np.array(read_box, np.int64).reshape(-1, 2) if len(read_box) else np.stack([0 * size, size], 1)
+        left = np.arange(steps - 1, -1, -1)[:, None, None]  # light goes one cell a step
+        needed = np.clip(box + left * np.array([-1, 1]), 0, size[:, None])
+        dark = np.zeros((groups, layout.z + 2, layout.y + 2, 2), np.int32)
+        dark[..., 0] = layout.x
+        full = dark.copy()
+        full[:, 1:-1, 1:-1] = (0, layout.x)
+        self.needed = torch.as_tensor(needed.astype(np.int32), device=like.device)
+        self._dark, self._full = (torch.as_tensor(spans, device=like.device) for spans in (dark, full))
+        self.moved = like.new_zeros(groups * layout.z * layout.y)
+        self._of: dict[int, torch.Tensor] = {}
+        self._views: dict[int, Any] = {}
+        self._constant = [as_warp(self.needed.view(-1)), as_warp(self.moved)]
+
+    def mark_dark(self, buffer: torch.Tensor) -> None:
+        """Say that a buffer is zero; of one that nothing was said of, anything may be anywhere."""
+        self._keep(buffer, self._dark)
+
+    def arguments(self, moving: torch.Tensor, into: torch.Tensor) -> list[Any]:
+        """What a step's kernel takes: ``lit``, ``lit_next``, ``needed``, ``moved``."""
+        for buffer in (moving, into):
+            if buffer.data_ptr() not in self._of:
+                self._keep(buffer, self._full)
+        return [self._views[moving.data_ptr()], self._views[into.data_ptr()], *self._constant]
+
+    def _keep(self, buffer: torch.Tensor, spans: torch.Tensor) -> None:
+        own = spans.clone()
+        self._of[buffer.data_ptr()], self._views[buffer.data_ptr()] = own, as_warp(own.view(-1))
+
+
+# S_{step+1} from S_step, added onto a total: (moving, into, total, step, spans), the first three flat padded buffers.
+Forward = Callable[[torch.Tensor, torch.Tensor, torch.Tensor, int, Spans], None]
+
 
 @lru_cache
 def _pool(threads: int) -> ThreadPoolExecutor:
@@ -120,6 +177,10 @@ class SlabLauncher:
         for future in waiting:
             future.result()
 
+    def release(self) -> None:
+        """Forget the recorded launches, which keep the buffers of the last one alive."""
+        self._commands.clear()
+
 
 def volumes_between(layout: Layout, volume: torch.Tensor, steps: int, checkpoint_every: int | None) -> int:
     """Steps from one kept volume to the next: every step up to 1 GiB, then about the square root of their number."""
@@ -133,14 +194,16 @@ def kept_volumes(layout: Layout, like: torch.Tensor, steps: int, keep: int) -> t
 
 
 def march(
-    layout: Layout, volume: torch.Tensor, steps: int, keep: int, tolerance: float, forward: Forward
+    layout: Layout, volume: torch.Tensor, steps: int, keep: int, tolerance: float, forward: Forward, spans: Spans
 ) -> tuple[torch.Tensor, torch.Tensor, int]:
-    """All steps: accumulated intensity [C, K, n_z, n_y, n_x], the kept volumes, and how many steps were taken."""
+    """All steps: padded accumulated intensity, the kept volumes, and how many steps were taken."""
     fields = layout.fields
     states = kept_volumes(layout, volume, steps, keep)
     for i, state in enumerate(states):  # zeroing all of it would cost as much as a step
         state.zero_() if i == 0 else layout.clear_border(state, fields)
     scratch = [layout.empty(fields, volume) for _ in range(2 if keep != 1 else 1)]
+    for buffer in scratch[0 if keep else 1 :]:  # without kept volumes the first one receives the injected light
+        spans.mark_dark(buffer)
 
     def home(step: int) -> torch.Tensor:
         kept = keep and step < steps and step % keep == 0
@@ -151,13 +214,13 @@ def march(
 
     total = layout.pad(volume, into=home(0)).clone()
     injected = flux(home(0)) if tolerance else 0.0
-    done = steps
     for step in range(steps):
-        if tolerance and flux(home(step)) <= tolerance * injected:
-            done = step
-            break
-        forward(home(step), home(step + 1), total, step)
-    return layout.inside(total, fields).reshape(volume.shape).contiguous(), states, done
+        if tolerance:
+            moving = injected if step == 0 else flux(home(step)) if volume.is_cuda else float(spans.moved.sum())
+            if moving <= tolerance * injected:
+                return total, states, step
+        forward(home(step), home(step + 1), total, step, spans)
+    return total, states, steps
 
 
 def steps_back(
@@ -168,11 +231,11 @@ def steps_back(
         yield from ((step, None) for step in reversed(range(done)))
         return
     between = [layout.empty(layout.fields, states) for _ in range(min(keep, steps) - 1)]
-    unused = layout.empty(layout.fields, states) if between else states
+    unused, spans = layout.empty(layout.fields, states) if between else states, Spans(layout, states, steps)
     for begin in reversed(range(0, done, keep)):
         count = min(keep, done - begin)
         volumes = [states[begin // keep], *between]
         for i in range(count - 1):
-            forward(volumes[i], volumes[i + 1], unused, begin + i)
+            forward(volumes[i], volumes[i + 1], unused, begin + i, spans)
         for i in reversed(range(count)):
             yield begin + i, volumes[i]

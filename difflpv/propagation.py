@@ -1,14 +1,15 @@
 """Propagation of a volume through its grid: all steps in one differentiable op.
 
-``propagate`` picks what is fastest for the stencil: one matrix per neighbour (a learned stencil) runs on torch's ``conv3d``
-with our adjoint (``difflpv.convolution``) or, with occlusion or on CUDA, on Warp kernels (``difflpv.linear_propagation``);
-faces run on the Warp kernels of ``difflpv.face_propagation``, with or without clamp and occlusion: their 30 or 54 fluxes
-are fewer products than the convolution's dense matrices (0.6 to 0.8 of its time, benchmarks/propagation.py). All agree with
-``difflpv.reference.propagation``, and a face stencil's linear part runs on any of them.
+``propagate`` picks what is fastest for the stencil: one matrix per neighbour (a learned stencil) runs on the Warp kernels of
+``difflpv.linear_propagation``, faces on those of ``difflpv.face_propagation``, with or without clamp and occlusion: their 30
+or 54 fluxes are fewer products than dense matrices. A linear stencil without occlusion also runs on torch's ``conv3d`` with
+our adjoint (``difflpv.convolution``), which takes 2 to 8 times as long and stays as a peer (benchmarks/propagation.py). All
+agree with ``difflpv.reference.propagation``, and a face stencil's linear part runs on any of them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
@@ -36,6 +37,7 @@ def propagate(
     matrices: torch.Tensor | None = None,
     tolerance: float = 0.0,
     checkpoint_every: int | None = None,
+    read_box: Sequence[int] | None = None,
     backend: Backend = "auto",
 ) -> torch.Tensor:
     """Move light through the grid for ``steps`` steps and add up what passes every cell.
@@ -52,10 +54,13 @@ def propagate(
         occlude_first_step: the publications leave the first step unoccluded (self-shadowing); True occludes it too.
         clamp: negative intensity carries no flux. Default True for face stencils; linear ones have none.
         matrices: learnable replacement [n,K,K] for a linear stencil's matrices.
-        tolerance: stop once the moving flux is below this share of the injected flux (0: never). Reads one number back
-            per step, which on CUDA waits for the device.
+        tolerance: stop once the moving flux, in cells that can still reach ``read_box``, is below this share of the
+            injected flux (0: never). Costs a thousandth of a step; on CUDA a reduction that waits for the device.
         checkpoint_every: keep every n-th volume for the backward pass and recompute between them. Default: every volume
             up to 1 GiB, then about the square root of ``steps``. Nothing is kept where nothing needs it.
+        read_box: cells that anything reads afterwards, (z, y, x) as (begin, end) pairs, six integers; what comes out
+            elsewhere is not complete and must get no gradient. On the CPU a step leaves out cells that are too far from the
+            box for what is left of the steps, as it leaves out cells that no light has reached. Default: all.
         backend: "auto", or force the Warp kernels or, without clamp and occlusion, ``conv3d``.
 
     Returns:
@@ -79,6 +84,7 @@ def propagate(
         raise ValueError(f"checkpoint_every: expected at least 1, got {checkpoint_every}")
     if not tolerance >= 0:
         raise ValueError(f"tolerance: expected a number >= 0, got {tolerance}")
+    box = _box(read_box, volume)
     refuse_forward_mode("propagate", volume, transmittance, matrices, factor if isinstance(factor, torch.Tensor) else None)
     factors = _factors(factor, steps, volume)
     if isinstance(stencil, LinearStencil):
@@ -86,7 +92,7 @@ def propagate(
             raise ValueError(f"clamp: stencil '{stencil.name}' is linear, it has none")
         return _linear(
             volume, stencil, matrices, factors, transmittance, occlude_first_step=occlude_first_step, tolerance=tolerance,
-            checkpoint_every=checkpoint_every, backend=backend,
+            checkpoint_every=checkpoint_every, box=box, backend=backend,
         )  # fmt: skip
     if matrices is not None:
         raise ValueError(f"matrices: only a linear stencil takes them, got a face stencil '{stencil.name}'")
@@ -105,7 +111,17 @@ def propagate(
         clamp=clamp,
         tolerance=tolerance,
         checkpoint_every=checkpoint_every,
+        read_box=box,
     )
+
+
+def _box(read_box: Sequence[int] | None, volume: torch.Tensor) -> list[int]:
+    if read_box is None:
+        return []
+    box, size = [int(v) for v in read_box], volume.shape[2:]
+    if len(box) != 6 or not all(0 <= box[2 * i] <= box[2 * i + 1] <= size[i] for i in range(3)):
+        raise ValueError(f"read_box: expected (begin, end) of z, y, x within {list(size)}, got {list(read_box)}")
+    return box
 
 
 def _factors(factor: float | torch.Tensor, steps: int, volume: torch.Tensor) -> torch.Tensor:
@@ -129,7 +145,7 @@ def _check_transmittance(transmittance: torch.Tensor | None, fields: int, volume
 def _linear(
     volume: torch.Tensor, stencil: LinearStencil, matrices: torch.Tensor | None, factors: torch.Tensor,
     transmittance: torch.Tensor | None, *, occlude_first_step: bool = False, tolerance: float,
-    checkpoint_every: int | None = None, backend: Backend,
+    checkpoint_every: int | None = None, box: Sequence[int] = (), backend: Backend,
 ) -> torch.Tensor:  # fmt: skip
     if matrices is None:
         matrices = torch.as_tensor(stencil.matrices, dtype=volume.dtype, device=volume.device)
@@ -142,7 +158,7 @@ def _linear(
         _check_transmittance(transmittance, stencil.pair_count, volume)
         if backend == "conv3d":
             raise ValueError("backend: conv3d has no occlusion; use 'auto' or 'warp'")
-    if backend == "conv3d" or (backend == "auto" and transmittance is None and not volume.is_cuda):
+    if backend == "conv3d":
         return propagate_convolution(volume, stencil.offsets, matrices, factors, tolerance=tolerance)
     return propagate_pairs(
         volume,
@@ -153,4 +169,5 @@ def _linear(
         occlude_first_step=occlude_first_step,
         tolerance=tolerance,
         checkpoint_every=checkpoint_every,
+        read_box=box,
     )

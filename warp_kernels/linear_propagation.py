@@ -26,7 +26,8 @@ pair, destination from source coefficients.
 Threads: one per (z, y) row on the CPU, ``lanes`` neighbouring cells at once, one per cell on CUDA; all channels in one
 thread, for they share the gradient of T, but one after the other, so that the fields of a pair stay in registers.
 ``matrices_kernel``: one per (slab of rows, matrix), partial sums per slab, so that their order does not depend on the number
-of threads. Snippets are native for the reasons given in ``warp_kernels.propagation``.
+of threads. Snippets are native for the reasons given in ``warp_kernels.propagation``. Cells that no light has reached, or that
+nothing reads, are left out (``warp_kernels.row_spans``).
 """
 
 import re
@@ -34,6 +35,8 @@ from functools import lru_cache
 from typing import Any
 
 import warp as wp
+
+from warp_kernels.row_spans import fill_spans
 
 __all__ = ["cpu_lanes", "matrices_kernel", "step_kernel"]
 
@@ -57,9 +60,11 @@ _STEP = (
     const SCALAR* w = weights.data;
     const long long line = (long long)(z + 1) * pitch_y + (y + 1);
     V factor_sum = zero;
+    SPANS_BEGIN
     for (int c = 0; c < channels; ++c)
     for (int x = x_begin; x < x_end; x += LANES) {
         const long long at = line * volume_line + c * COEFFS * pitch + x + 1;
+        SPANS_SKIP
         V flux[COEFFS], u[COEFFS], v[COEFFS];
         #pragma unroll
         for (int k = 0; k < COEFFS; ++k) {
@@ -137,7 +142,9 @@ _STEP = (
             if (x == 0) out[-1] = 0;  // and make it so where ``next`` is fresh memory
             if (x + LANES >= x_size) out[LANES] = 0;
         }
+        SPANS_NOTE
     }
+    SPANS_END
     if (NEED_FACTOR) {
         SCALAR* out = factor_bar.data + ((long long)step * z_size + z) * y_size + y;
 #if defined(__CUDA_ARCH__)
@@ -236,15 +243,17 @@ def step_kernel(
 ) -> Any:  # fmt: skip
     """One step forward, or of the adjoint: scalar type, K, lanes (1: a thread per cell, CUDA), flags."""
     floats, ints = wp.array(dtype=scalar), wp.array(dtype=wp.int32)
+    text = fill_spans(_STEP, used=lanes > 1 and not adjoint, group="0", fields=coeffs, at="at")
     text = _snippet(
-        _STEP, scalar, coeffs=coeffs, lanes=lanes, paired=paired, occluded=occluded, adjoint=adjoint,
+        text, scalar, coeffs=coeffs, lanes=lanes, paired=paired, occluded=occluded, adjoint=adjoint,
         need_factor=need_factor, need_transmittance=need_transmittance,
     )  # fmt: skip
 
     @wp.func_native(text)
     def step_row(
         moving: floats, next: floats, accumulated: floats, transmittance: floats, before: floats, transmittance_bar: floats,
-        factor_bar: floats, weights: floats, factor: floats, line_shift: ints, x_shift: ints, pairs: int, step: int,
+        factor_bar: floats, weights: floats, factor: floats, line_shift: ints, x_shift: ints, lit: ints, lit_next: ints,
+        needed: ints, moved: floats, pairs: int, step: int,
         pitch_y: int, pitch: int, channels: int, z_size: int, y_size: int, x_size: int, x_begin: int, x_end: int, z: int,
         y: int,
     ): ...  # fmt: skip
@@ -252,7 +261,8 @@ def step_kernel(
     @wp.kernel(enable_backward=False, module="unique")
     def propagate_linear(
         moving: floats, next: floats, accumulated: floats, transmittance: floats, before: floats, transmittance_bar: floats,
-        factor_bar: floats, weights: floats, factor: floats, line_shift: ints, x_shift: ints, pairs: int, step: int,
+        factor_bar: floats, weights: floats, factor: floats, line_shift: ints, x_shift: ints, lit: ints, lit_next: ints,
+        needed: ints, moved: floats, pairs: int, step: int,
         pitch_y: int, pitch: int, channels: int, z_size: int, y_size: int, x_size: int, row: int,
     ):  # fmt: skip
         line, x = wp.tid()
@@ -260,8 +270,8 @@ def step_kernel(
         x_begin, x_end = wp.where(wp.static(lanes == 1), x, 0), wp.where(wp.static(lanes == 1), x + 1, x_size)
         step_row(
             moving, next, accumulated, transmittance, before, transmittance_bar, factor_bar, weights, factor, line_shift,
-            x_shift, pairs, step, pitch_y, pitch, channels, z_size, y_size, x_size, x_begin, x_end, line // y_size,
-            line % y_size,
+            x_shift, lit, lit_next, needed, moved, pairs, step, pitch_y, pitch, channels, z_size, y_size, x_size, x_begin,
+            x_end, line // y_size, line % y_size,
         )  # fmt: skip
 
     return propagate_linear

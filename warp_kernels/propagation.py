@@ -24,6 +24,7 @@ f for T, (c, a) for H. The forward step reads T where it arrives, ``arriving[i,d
 Threads: one per (channel group, z, y) row on the CPU, one per cell on CUDA. Within a row the CPU works on ``LANES``
 neighbouring cells at once (vector extension of the compiler that Warp brings along): Warp itself does not vectorise across
 the threads of a CPU launch. The bodies are native snippets for that reason; there is nothing for Warp to differentiate.
+Cells that no light has reached, or that nothing reads, are left out (``warp_kernels.row_spans``).
 """
 
 import re
@@ -31,6 +32,8 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import warp as wp
+
+from warp_kernels.row_spans import fill_spans
 
 __all__ = ["CPU_LANES", "adjoint_kernel", "forward_kernel"]
 
@@ -56,7 +59,9 @@ _TYPES = """
 _FORWARD = (
     _TYPES
     + """
+    SPANS_BEGIN
     for (int x = x_begin; x < x_end; x += LANES) {
+        SPANS_SKIP
         V flux[AXES * CHANNELS];
         #pragma unroll
         for (int i = 0; i < AXES * CHANNELS; ++i) flux[i] = zero;
@@ -103,7 +108,9 @@ _FORWARD = (
                 if (x == 0) out[-1] = 0;  // and make it so where ``next`` is fresh memory
                 if (x + LANES >= x_size) out[LANES] = 0;
             }
+        SPANS_NOTE
     }
+    SPANS_END
 """
 )
 
@@ -236,18 +243,22 @@ def forward_kernel(
     """One step forward: scalar type, K, lobe axes, channels per thread, lanes (1: a thread per cell, CUDA), flags."""
     floats, ints = wp.array(dtype=scalar), wp.array(dtype=wp.int32)
 
-    @wp.func_native(_Spec(scalar, coeffs, axes, channels, lanes, clamp, occluded).snippet(_FORWARD))
+    text = fill_spans(_FORWARD, used=lanes > 1, group="group", fields=channels * coeffs, at="volume_at + x + 1")
+
+    @wp.func_native(_Spec(scalar, coeffs, axes, channels, lanes, clamp, occluded).snippet(text))
     def forward_row(
         moving: floats, next: floats, accumulated: floats, arriving: floats, weights: floats, lobes: floats,
-        factor: floats, line_shift: ints, x_shift: ints, first: ints, face: ints, axis: ints, neighbours: int, faces: int,
-        step: int, pitch_y: int, pitch: int, groups: int, x_size: int, x_begin: int, x_end: int, group: int, z: int, y: int,
+        factor: floats, line_shift: ints, x_shift: ints, first: ints, face: ints, axis: ints, lit: ints, lit_next: ints,
+        needed: ints, moved: floats, neighbours: int, faces: int, step: int, pitch_y: int, pitch: int, groups: int, z_size: int,
+        y_size: int, x_size: int, x_begin: int, x_end: int, group: int, z: int, y: int,
     ): ...  # fmt: skip
 
     @wp.kernel(enable_backward=False, module="unique")
     def propagate_forward(
         moving: floats, next: floats, accumulated: floats, arriving: floats, weights: floats, lobes: floats,
-        factor: floats, line_shift: ints, x_shift: ints, first: ints, face: ints, axis: ints, neighbours: int, faces: int,
-        step: int, pitch_y: int, pitch: int, groups: int, z_size: int, y_size: int, x_size: int, row: int,
+        factor: floats, line_shift: ints, x_shift: ints, first: ints, face: ints, axis: ints, lit: ints, lit_next: ints,
+        needed: ints, moved: floats, neighbours: int, faces: int, step: int, pitch_y: int, pitch: int, groups: int, z_size: int,
+        y_size: int, x_size: int, row: int,
     ):  # fmt: skip
         line, x = wp.tid()
         line = line + row
@@ -255,8 +266,9 @@ def forward_kernel(
         z = (line // y_size) % z_size
         x_begin, x_end = wp.where(wp.static(lanes == 1), x, 0), wp.where(wp.static(lanes == 1), x + 1, x_size)
         forward_row(
-            moving, next, accumulated, arriving, weights, lobes, factor, line_shift, x_shift, first, face, axis,
-            neighbours, faces, step, pitch_y, pitch, groups, x_size, x_begin, x_end, line // (y_size * z_size), z, y,
+            moving, next, accumulated, arriving, weights, lobes, factor, line_shift, x_shift, first, face, axis, lit,
+            lit_next, needed, moved, neighbours, faces, step, pitch_y, pitch, groups, z_size, y_size, x_size, x_begin, x_end,
+            line // (y_size * z_size), z, y,
         )  # fmt: skip
 
     return propagate_forward
