@@ -39,6 +39,7 @@ __all__ = ["Component", "Illumination", "LightValues", "Receivers", "illuminate"
 
 Component = Literal["direct", "bounce1"]
 _EXTENTS = (1e-5, 1e9)  # m; Embree and the fourth power of a distance in float32 set these
+_FARTHEST_READ = 3.5  # cells: the largest bias (difflpv.learnables), half a cell of damping, one of the weights
 _FARTHEST = 1e3  # distance from the origin over the extent; rays start 2e-5 of it off a surface
 
 
@@ -79,6 +80,7 @@ class Receivers:
         visible: which point, spot and directional light each sees, uint8 [n,m] (component "direct" only).
         reads: cells that each may read, for each of the configuration's grids; empty where the lookup reads all eight.
         lookup: what they were picked by.
+        boxes: for each of the grids a box of cells that holds all that is read, (z, y, x) as (begin, end) pairs.
     """
 
     position: torch.Tensor
@@ -86,6 +88,7 @@ class Receivers:
     visible: torch.Tensor | None = None
     reads: tuple[CellReads, ...] = ()
     lookup: Lookup = "trilinear"
+    boxes: tuple[tuple[int, ...], ...] = ()
 
     def __len__(self) -> int:
         return len(self.position)
@@ -181,15 +184,17 @@ class Illumination:
         x, n = (torch.as_tensor(a, dtype=like.dtype, device=like.device).detach() for a in (position, normal))
         check_points("position", x)
         check_points("normal", n, count=len(x))
-        seen, reads = None, []
+        seen, reads, grids = None, [], self.config.grids(self.grid)
+        boxes = [_box_around(x, grid) for grid in grids]
         if self.config.lookup in ("front", "visible", "affine"):
-            for grid in self.config.grids(self.grid):
+            for grid in grids:
                 usable = self._open_cells(x, n, self.config.lookup, grid, _BIAS)
                 reads.append(CellReads(usable.cells, usable.weights(x, n, grid), usable.backed))
+            boxes = [r.box(grid) for r, grid in zip(reads, grids, strict=True)]
         punctual = self._punctual()
         if self.component == "direct" and bool(punctual.any()):
             seen = visibility(x, n, self.emitters.select(punctual), self.raycaster)
-        return Receivers(x, n, seen, tuple(reads), self.config.lookup or "trilinear")
+        return Receivers(x, n, seen, tuple(reads), self.config.lookup or "trilinear", tuple(boxes))
 
     def punctual_irradiance(self, receivers: Receivers, values: LightValues | None = None) -> torch.Tensor | None:
         """Direct irradiance [n,3] W/m2 of point, spot and directional lights by shadow rays; None where there is none."""
@@ -302,6 +307,17 @@ def _check_extent(scene: Scene) -> None:
             f"scene '{scene.name}': {extent:.3g} m across but {reach:.3g} m from the origin, more than {_FARTHEST:g} times its "
             "size: float32 rays cannot tell its surfaces apart; move it to the origin"
         )
+
+
+def _box_around(x: torch.Tensor, grid: Grid) -> tuple[int, ...]:
+    """Box of the cells that points [n,3] m may read by trilinear weights, whatever their normal and bias are."""
+    if not len(x):
+        return (0, 0, 0, 0, 0, 0)
+    low, high = ((v.cpu().double().numpy() - grid.minimum) / grid.cell_size for v in (x.amin(0), x.amax(0)))
+    size = np.array(grid.resolution)
+    begin = np.clip(np.floor(low - _FARTHEST_READ), 0, size - 1).astype(int)
+    end = np.clip(np.ceil(high + _FARTHEST_READ), 1, size).astype(int)
+    return tuple(int(v) for axis in (2, 1, 0) for v in (begin[axis], end[axis]))
 
 
 def _of_area_lights(scene: Scene, emitters: Emitters) -> torch.Tensor:

@@ -53,6 +53,15 @@ class CellReads:
     weights: torch.Tensor
     backed: torch.Tensor
 
+    def box(self, grid: Grid) -> tuple[int, ...]:
+        """The box of all these cells: (z, y, x) as (begin, end) pairs, for ``difflpv.propagation.propagate``."""
+        cells = self.cells.cpu().numpy().ravel()
+        n_x, n_y, n_z = grid.resolution
+        if not len(cells):
+            return (0, 0, 0, 0, 0, 0)
+        parts = (cells // (n_x * n_y), cells // n_x % n_y, cells % n_x)
+        return tuple(int(v) for part in parts for v in (part.min(), part.max() + 1))
+
 
 @dataclass(frozen=True, eq=False)
 class OpenCells:

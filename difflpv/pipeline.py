@@ -147,7 +147,7 @@ class Lpv(torch.nn.Module):
             ValueError: an illumination made for another grid, or without the occlusion that the configuration names.
             FloatingPointError: the result is not finite.
         """
-        return self.gather(self.accumulate(illumination, values), illumination, receivers, values)
+        return self.gather(self.accumulate(illumination, values, receivers), illumination, receivers, values)
 
     def gather(
         self,
@@ -171,10 +171,17 @@ class Lpv(torch.nn.Module):
         return irradiance
 
     def accumulate(
-        self, illumination: Illumination, values: Mapping[str, torch.Tensor] | None = None
+        self,
+        illumination: Illumination,
+        values: Mapping[str, torch.Tensor] | None = None,
+        receivers: Receivers | None = None,
     ) -> tuple[torch.Tensor, ...]:
-        """The solved volume [3, K, n_z, n_y, n_x] W/sr of each grid, finest first: shade, inject, occlude, propagate."""
-        volume, moved = self._start(illumination, values)
+        """The solved volume [3, K, n_z, n_y, n_x] W/sr of each grid, finest first: shade, inject, occlude, propagate.
+
+        With ``receivers`` only what they read is complete: what nobody reads is left out.
+        """
+        boxes = () if receivers is None else receivers.boxes
+        volume, moved = self._start(illumination, values, boxes)
         first, steps = self.config.fine_steps, self.config.steps
         solved = moved(volume, 0, 0, first)
         if first == steps:
@@ -201,7 +208,10 @@ class Lpv(torch.nn.Module):
             yield light
 
     def _start(
-        self, illumination: Illumination, values: Mapping[str, torch.Tensor] | None
+        self,
+        illumination: Illumination,
+        values: Mapping[str, torch.Tensor] | None,
+        boxes: Sequence[Sequence[int]] = (),
     ) -> tuple[torch.Tensor, Callable[[torch.Tensor, int, int, int], torch.Tensor]]:
         """The injected volume, and ``moved(light, level, begin, end)``: the sum of light over steps on one of the grids."""
         if illumination.grid != self.grid:
@@ -234,6 +244,8 @@ class Lpv(torch.nn.Module):
                 matrices=matrices,
                 tolerance=config.tolerance,
                 checkpoint_every=self.checkpoint_every,
+                # light that goes on in coarser cells is read everywhere
+                read_box=boxes[level] if level < len(boxes) and end == config.steps else None,
             )
 
         return volume, moved

@@ -35,10 +35,13 @@ def solve_irradiance(lpv: Lpv, light: Illumination, position: np.ndarray, normal
     Raises:
         FloatingPointError: the result is not finite.
     """
-    parts = []
+    parts, volumes = [], None
     for begin in range(0, max(len(position), 1), _RECEIVERS_PER_CHUNK):
         rows = slice(begin, begin + _RECEIVERS_PER_CHUNK)
-        parts.append(lpv(light, light.receivers(position[rows], normal[rows])).cpu().numpy())
+        receivers = light.receivers(position[rows], normal[rows])
+        if volumes is None:  # solved once for all of them; of a single chunk only where it reads
+            volumes = lpv.accumulate(light, receivers=receivers if len(position) <= _RECEIVERS_PER_CHUNK else None)
+        parts.append(lpv.gather(volumes, light, receivers).cpu().numpy())
     irradiance = np.concatenate(parts).astype(np.float64)
     return Prediction(irradiance, describe_trouble(lpv, light, position, normal, irradiance))
 

@@ -3,6 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from hand_scenes import LIGHT, box_scene, panel_scene
 
 import difflpv.simulate
@@ -60,6 +61,30 @@ def test_same_seed_same_bits_and_chunks_do_not_matter(monkeypatch):
     assert np.array_equal(whole, predict(1)) and not np.array_equal(whole, predict(2))
     monkeypatch.setattr(difflpv.simulate, "_RECEIVERS_PER_CHUNK", 2)
     assert np.array_equal(whole, predict(1))
+
+
+def test_receivers_are_solved_for_once_whatever_their_number(monkeypatch):
+    solves = []
+    accumulate = Lpv.accumulate
+    monkeypatch.setattr(Lpv, "accumulate", lambda *args, **options: solves.append(1) or accumulate(*args, **options))
+    monkeypatch.setattr(difflpv.simulate, "_RECEIVERS_PER_CHUNK", 1)
+    assert len(simulate(panel_scene(floor=2.0), POSITION, NORMAL, grid=GRID, config=CONFIG).irradiance) == 3
+    assert solves == [1]
+
+
+@pytest.mark.parametrize("options", [
+    {"method": "holpv"}, {"method": "lpv", "lookup": "damped"}, {"method": "learned_4x6"},
+    {"method": "learned_9x26", "coarsen_after": 2},
+])  # fmt: skip
+def test_leaving_out_what_nobody_reads_changes_no_bit(options):
+    config = LpvConfig(steps=10, **options)
+    scene, grid = panel_scene(floor=2.0), Grid((-1.33, -1.27, -1.41), 0.2, (14, 14, 14))
+    light, lpv = illuminate(scene, grid, config, "bounce1"), Lpv(grid, config)
+    for row in range(3):
+        receivers = light.receivers(POSITION[row : row + 1], NORMAL[row : row + 1])
+        whole = lpv.gather(lpv.accumulate(light), light, receivers)
+        assert torch.equal(lpv(light, receivers), whole)
+        assert whole.abs().max() > 0
 
 
 def test_a_grid_that_does_not_contain_the_scene():
