@@ -11,6 +11,7 @@ from warp_kernels.occlusion import occlusion_kernels
 from warp_kernels.propagation import adjoint_kernel, forward_kernel
 from warp_kernels.rsm import rsm_kernels
 from warp_kernels.sampling import sampling_kernels
+from warp_kernels.tetrahedra import tetrahedra_kernels
 from warp_kernels.weighted import weighted_kernels
 
 FACES = {"coeffs": 9, "axes": 6, "channels": 3, "lanes": 1, "clamp": True, "occluded": True}
@@ -28,6 +29,7 @@ KERNELS = {
     "occlusion": lambda s: occlusion_kernels(s)[0],
     "rsm": lambda s: rsm_kernels(s)[0],
     "sampling": lambda s: sampling_kernels(s)[0],
+    "tetrahedra": lambda s: tetrahedra_kernels(s).locate,
     "weighted": lambda s: weighted_kernels(s)[0],
 }
 
