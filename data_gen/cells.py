@@ -7,6 +7,10 @@ floor of every table. ``kept_volume`` path-traces it once and finds it again on 
 from __future__ import annotations
 
 import hashlib
+import multiprocessing
+import signal
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,7 +24,7 @@ from difflpv.grid import Grid
 from difflpv.io.tables import TableError, load_table, save_table
 from difflpv.scene import AreaLight, Scene
 
-__all__ = ["TrueVolume", "find_volume", "kept_volume", "trace_volume", "true_volume"]
+__all__ = ["TrueVolume", "find_volume", "kept_volume", "kept_volumes", "trace_volume", "true_volume"]
 
 _STREAM = 104
 _PATHS = 2**17
@@ -109,6 +113,30 @@ def kept_volume(
     path.parent.mkdir(parents=True, exist_ok=True)
     save_table(path, halves=made.halves.astype(np.float32), spp=made.spp, seed=made.seed)
     return find_volume(folder, scene, grid, component) or made  # read back: the same bits as the next run's
+
+
+def kept_volumes(
+    folder: str | Path, scenes: Sequence[Scene], grid: Grid, component: str, *, spp: int, seed: int = 0, workers: int = 1
+) -> list[TrueVolume]:
+    """``kept_volume`` of a scene under several sets of lights, a process for each up to ``workers``; the same bits for any.
+
+    Raises:
+        KeyboardInterrupt: passed on; volumes that are finished are kept.
+    """
+    if workers > 1 and len(scenes) > 1:
+        spawn = multiprocessing.get_context("spawn")
+        pool = ProcessPoolExecutor(min(workers, len(scenes)), mp_context=spawn, initializer=_leave_interrupt_to_parent)
+        try:
+            jobs = [pool.submit(kept_volume, folder, scene, grid, component, spp=spp, seed=seed) for scene in scenes]
+            for job in jobs:
+                job.result()
+        finally:
+            pool.shutdown(cancel_futures=True)
+    return [kept_volume(folder, scene, grid, component, spp=spp, seed=seed) for scene in scenes]
+
+
+def _leave_interrupt_to_parent() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def find_volume(folder: str | Path, scene: Scene, grid: Grid, component: str) -> TrueVolume | None:

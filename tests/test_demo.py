@@ -62,7 +62,7 @@ def test_demo_writes_everything_and_tells_the_table(demo, told):
     assert told[-1].startswith(f"\n{demo.table}") and str(demo.report) in told[-1]
     assert {path.stem for path in (out / "figures").iterdir()} == {"renders", "convergence", "lights", "factors"}
     assert DemoSummary.read(out).values == demo.values
-    assert [s.method for s in demo.test if s.component == "bounce1"] == list(run._IN_TABLE)
+    assert [s.method for s in demo.test if s.component == "bounce1"] == [*run._IN_TABLE, "floor"]
     assert [s.method for s in demo.test if s.component == "direct"] == ["constant", "LPV", "HOLPV", "learned_9x26"]
     for row in demo.values["rows"]:
         assert row["test"]["relative_l2"] > 0 and f"{row['test']['relative_l2']:7.3f}" in demo.table

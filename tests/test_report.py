@@ -27,7 +27,7 @@ def error(value):
 
 def summary(errors=(0.6, 2.0, 0.5, 0.55, 0.8, 0.31, 0.4)):
     """What a demo writes, with test errors by method."""
-    found = dict(zip(METHODS, errors, strict=True))
+    found = dict(zip(METHODS, errors, strict=True)) | {"floor": 0.1}
     history = [[1.0, 0.5, 0.9], [2.0, 1.0, None], [3.0, 1.5, 0.4]]
     fits = {}
     for name in METHODS:
@@ -43,11 +43,11 @@ def summary(errors=(0.6, 2.0, 0.5, 0.55, 0.8, 0.31, 0.4)):
             }
     rows = [
         {"component": c, "method": m, "train": error(0.9 * found[m]), "test": error(found[m])}
-        for c, methods in (("bounce1", METHODS), ("direct", ("constant", "LPV", "HOLPV")))
+        for c, methods in (("bounce1", (*METHODS, "floor")), ("direct", ("constant", "LPV", "HOLPV")))
         for m in methods
     ]
     scores = [
-        {"method": m, "component": "bounce1", "light": k, **error(found[m] * (1 + 0.1 * k))} for m in METHODS for k in range(4)
+        {"method": m, "component": "bounce1", "light": k, **error(found[m] * (1 + 0.1 * k))} for m in found for k in range(4)
     ]
     noise = {c: {"train": 0.04, "test": 0.05} for c in ("bounce1", "direct")}
     return {
@@ -64,6 +64,7 @@ def summary(errors=(0.6, 2.0, 0.5, 0.55, 0.8, 0.31, 0.4)):
         "rows": rows,
         "scores": scores,
         "fits": fits,
+        "floor": {"spp": 64, "noise": {"train": 0.03, "test": 0.02}},
         "machine": {
             "processor": "a <fast> one",
             "cores": 2,
@@ -132,6 +133,7 @@ def test_verdict_names_the_best_and_those_that_are_worse_than_a_constant():
     assert "<strong>HOLPV fitted</strong>" in text and "0.310" in text and "0.800 for HOLPV as published" in text
     assert "overall brightness" not in text  # at best scale it gains a tenth
     assert "Worse than a constant: LPV (2.00) and HOLPV (0.80)" in text
+    assert "The floor is 0.100" in text and "(64 paths a cell) would alone measure 0.020" in text
 
 
 def test_verdict_is_honest_where_a_published_method_wins():

@@ -14,6 +14,7 @@ from data_gen.load import Targets
 from data_gen.targets import make_targets
 from difflpv.config import LpvConfig, Method, grid_for
 from difflpv.demo.fits import fit_once
+from difflpv.demo.floor import judge_floor
 from difflpv.demo.settings import FITS, SCENE, UNFITTED, DemoSettings
 from difflpv.demo.summary import (
     DemoSummary,
@@ -48,7 +49,7 @@ _IN_TABLE = (
     "HOLPV nlopt",
     "learned_9x26",
     "learned_9x26 fitted",
-)
+)  # the floor comes last
 _IN_PICTURE = ("LPV fitted", "HOLPV", "HOLPV fitted", "learned_9x26", "learned_9x26 fitted")
 _IN_README = ("HOLPV", "HOLPV fitted", "learned_9x26 fitted")
 _README_DPI = 100  # keeps the file small
@@ -130,8 +131,12 @@ def run_demo(
         )
         fits[plan.name]["factors"] = models[plan.name].step_factors().tolist()
 
+    progress(f"path tracing the true light in the cells, {sizes.floor_spp} paths each")
+    floors, floor = judge_floor(
+        traced["learned_9x26"], sizes, folder=folder / "targets" / "floor", seed=seed, workers=count
+    )
     progress("judging and rendering")
-    scores = _judge(models, traced)
+    scores = _judge(models, traced) + floors
     direct = {m: _light_targets(scene, targets, sizes.published(m), "direct", sizes, seed) for m in _METHODS}
     scores += _judge({name: models[name] for name in UNFITTED}, direct)
     lit: dict[str, Illumination] = {method: lights[sizes.image_light].illumination for method, lights in traced.items()}
@@ -150,6 +155,7 @@ def run_demo(
         "rows": mean_rows(scores, sizes.train, sizes.test),
         "scores": [score.to_json() for score in scores],
         "fits": fits,
+        "floor": floor,
         "machine": describe_machine(),
         "resumed": any(path.stat().st_mtime < begun_at for path in _made(folder)),
         "identity": identity,

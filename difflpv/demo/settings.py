@@ -29,6 +29,7 @@ class DemoSettings:
         lpv_budget: forward-equivalents of each fit of an LPV, one being a solve of all train lights.
         holpv_budget: the same for a HOLPV, whose solve takes about twice as long.
         learned_budget: the same for the learned stencil.
+        floor_spp: paths per cell for the true light in the cells.
     """
 
     receivers: int = 2000
@@ -44,6 +45,7 @@ class DemoSettings:
     lpv_budget: float = 72.0
     holpv_budget: float = 48.0
     learned_budget: float = 30.0
+    floor_spp: int = 512
 
     def __post_init__(self) -> None:
         if not self.train or self.image_light not in self.test or set(self.train) & set(self.test):
@@ -66,6 +68,7 @@ class DemoSettings:
             lpv_budget=36.0,
             holpv_budget=24.0,
             learned_budget=18.0,
+            floor_spp=256,
         )
 
     @property

@@ -24,6 +24,7 @@ _ERROR_RANGE = 2.0  # of the error maps, in means of the path-traced image
 # Okabe and Ito's palette, which colour-blind readers can tell apart: one hue per method, nlopt lighter and dashed.
 _COLORS = {
     "constant": "#777777",
+    "floor": "#222222",
     "LPV": "#e69f00",
     "LPV fitted": "#d55e00",
     "LPV nlopt": "#eda57c",
@@ -34,7 +35,7 @@ _COLORS = {
     "learned_9x26 fitted": "#00795a",
 }
 _MARKERS = {"constant": "_", "LPV": "s", "LPV fitted": "s", "HOLPV": "o", "HOLPV fitted": "o"}
-_MARKERS |= {"learned_9x26": "D", "learned_9x26 fitted": "D"}
+_MARKERS |= {"learned_9x26": "D", "learned_9x26 fitted": "D", "floor": "_"}
 _TICKS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
 _MORE_TICKS = (0.03, 0.04, 0.06, 0.08, 0.15, 0.3, 0.4, 0.6, 0.7, 0.8, 1.2, 1.5, 3.0, 4.0)
 
@@ -154,14 +155,15 @@ def draw_lights(scores: Sequence[Mapping[str, Any]], train: Sequence[int], test:
         by_light = {s["light"]: s["relative_l2"] for s in scores if s["method"] == method}
         y = [by_light[light] for light in order]
         x = np.arange(len(order)) + 0.09 * (k - (len(methods) - 1) / 2)
-        filled = method.endswith("fitted") or method == "constant"
+        bar = method in ("constant", "floor")
+        filled = bar or method.endswith("fitted")
         axis.plot(
             x,
             y,
             _MARKERS[method],
             color=_COLORS[method],
-            markersize=13 if method == "constant" else 7,
-            markeredgewidth=2.4 if method == "constant" else 1.6,
+            markersize=13 if bar else 7,
+            markeredgewidth=2.4 if bar else 1.6,
             markerfacecolor=_COLORS[method] if filled else "white",
         )
         ends.append((len(order) - 0.55, y[-1], method, _COLORS[method]))

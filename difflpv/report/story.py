@@ -33,7 +33,7 @@ def three_sentences(values: Mapping[str, Any]) -> str:
 def verdict(values: Mapping[str, Any]) -> str:
     """Who is best on the test lights, and by how much."""
     error = _test_errors(values)
-    methods = {name: e for name, e in error.items() if name != "constant"}
+    methods = {name: e for name, e in error.items() if name not in ("constant", "floor")}
     best = min(methods, key=lambda name: methods[name])
     parts = [f"On the test lights <strong>{escape(best)}</strong> comes closest, with a relative error of {error[best]:.3f}"]
     base = best.split()[0]
@@ -42,6 +42,12 @@ def verdict(values: Mapping[str, Any]) -> str:
         against.append(f"{error[base]:.3f} for {_unfitted(base)}")
     against.append(f"{error['constant']:.3f} for a constant")
     noise = values["targets"]["noise"]["bounce1"]["test"]
+    floor = values["floor"]
+    parts.append(
+        f" The floor is {error['floor']:.3f}: the true light in the cells, path-traced and read by the learned stencil’s "
+        "lookup, which no propagation of second order on this grid can be expected to beat by much. Its own noise "
+        f"({floor['spp']} paths a cell) would alone measure {floor['noise']['test']:.3f}."
+    )
     published = _test_row(values, base)
     parts.append(f" against {' and '.join(against)}; a perfect method would measure {noise:.3f}, the noise of the targets.")
     if published["scaled_l2"] < 0.8 * published["relative_l2"]:
