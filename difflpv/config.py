@@ -47,9 +47,9 @@ class LpvConfig:
             which has no self-shadowing to avoid, else False.
         l_max: SH degree, None for the method's own.
         tolerance: stop when the moving flux falls below this share (0: never).
-        coarsen_after: after so many steps (which are taken twice, to tell what still moves) light goes on in cells of twice
-            the edge, where a step is an eighth of the work and goes twice as far; receivers read both grids, and
-            ``tolerance`` counts on each by itself. None, or no step left: one grid.
+        coarsen_after: after so many steps light goes on in cells of twice the edge, where a step is an eighth of the work and
+            goes twice as far; receivers read both grids, and ``tolerance`` counts on each by itself. None, or no step left:
+            one grid.
     """
 
     method: Method = "holpv"

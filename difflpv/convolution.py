@@ -1,7 +1,8 @@
 """Linear stencils on torch's ``conv3d`` with our own adjoint.
 
 A linear step is a 3x3x3 convolution from K to K channels, the colours being its batch: S' = p A * S. The adjoint of the
-volume is one more forward convolution with the transposed stencil, q_i = A^T * G_{i+1}, G_i = Abar + p_i q_i; the factor's
+volume is one more forward convolution with the transposed stencil, q_i = A^T * G_{i+1}, G_i = Abar + p_i q_i (from G_N =
+Abar, and the cotangent of S_N where that is asked for too); the factor's
 gradient is <q_i, S_i>, and a matrix' gradient is one small correlation, sum_d G_{i+1}(d) S_i(d - n)^T p_i. torch's own
 backward through ``conv3d`` costs 3 to 20 times its forward. channels_last_3d is 3 to 10 times faster than the contiguous
 layout at 64^3 on a CPU.
@@ -47,8 +48,9 @@ def _correlations(after: torch.Tensor, before: torch.Tensor, offsets: torch.Tens
 
 @torch.library.custom_op("difflpv::propagate_convolution", mutates_args=())
 def _propagate(
-    volume: torch.Tensor, offsets: torch.Tensor, matrices: torch.Tensor, factors: torch.Tensor, tolerance: float, keep: bool
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    volume: torch.Tensor, offsets: torch.Tensor, matrices: torch.Tensor, factors: torch.Tensor, tolerance: float, keep: bool,
+    rest: bool,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
     weight = _kernel(offsets, matrices.detach())
     moving = volume.detach().clone(memory_format=torch.channels_last_3d)
     total = moving.clone(memory_format=torch.channels_last_3d)
@@ -65,7 +67,8 @@ def _propagate(
         if p != 1.0:
             moving *= p
         total += moving
-    return total.contiguous(), states, torch.tensor(done)
+    last = moving.clone(memory_format=torch.contiguous_format) if rest else volume.new_empty(0)
+    return total.contiguous(), last, states, torch.tensor(done)
 
 
 def _state_shape(volume: torch.Tensor, slots: int) -> tuple[int, ...]:
@@ -75,19 +78,20 @@ def _state_shape(volume: torch.Tensor, slots: int) -> tuple[int, ...]:
 
 
 @_propagate.register_fake
-def _(volume, offsets, matrices, factors, tolerance, keep):
+def _(volume, offsets, matrices, factors, tolerance, keep, rest):
     states = volume.new_empty(_state_shape(volume, len(factors) if keep else 0))
-    return torch.empty_like(volume, memory_format=torch.contiguous_format), states, torch.empty((), dtype=torch.int64)
+    total = torch.empty_like(volume, memory_format=torch.contiguous_format)
+    return total, torch.empty_like(total) if rest else volume.new_empty(0), states, torch.empty((), dtype=torch.int64)
 
 
 @torch.library.custom_op("difflpv::propagate_convolution_backward", mutates_args=())
 def _propagate_backward(
-    total_bar: torch.Tensor, states: torch.Tensor, done: torch.Tensor, offsets: torch.Tensor, matrices: torch.Tensor,
-    factors: torch.Tensor, need_matrices: bool, need_factors: bool,
+    total_bar: torch.Tensor, moving_bar: torch.Tensor, states: torch.Tensor, done: torch.Tensor, offsets: torch.Tensor,
+    matrices: torch.Tensor, factors: torch.Tensor, need_matrices: bool, need_factors: bool,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
     transposed = _kernel(-offsets, matrices.detach().transpose(1, 2))
     source = total_bar.detach().contiguous(memory_format=torch.channels_last_3d)
-    after = source
+    after = source + moving_bar if moving_bar.numel() else source
     matrices_bar, factors_bar = torch.zeros_like(matrices), torch.zeros_like(factors)
     factor = factors.tolist()
     for step in reversed(range(int(done))):
@@ -102,7 +106,7 @@ def _propagate_backward(
 
 
 @_propagate_backward.register_fake
-def _(total_bar, states, done, offsets, matrices, factors, need_matrices, need_factors):
+def _(total_bar, moving_bar, states, done, offsets, matrices, factors, need_matrices, need_factors):
     bar = torch.empty_like(total_bar, memory_format=torch.contiguous_format)
     return bar, torch.empty_like(matrices), torch.empty_like(factors)
 
@@ -111,22 +115,25 @@ refuse_second_derivative("propagate", _propagate_backward)
 
 
 def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[torch.Tensor, ...]) -> None:
-    _, offsets, matrices, factors, _, _ = inputs
-    _, states, done = output
+    _, offsets, matrices, factors, *_ = inputs
+    _, _, states, done = output
     ctx.mark_non_differentiable(states, done)
     ctx.save_for_backward(states, done, offsets, matrices, factors)
 
 
-def _backward(ctx: Any, total_bar: torch.Tensor, *unused: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-    need_volume, _, need_matrices, need_factors, _, _ = ctx.needs_input_grad
-    volume_bar, matrices_bar, factors_bar = _propagate_backward(total_bar, *ctx.saved_tensors, need_matrices, need_factors)
+def _backward(
+    ctx: Any, total_bar: torch.Tensor, moving_bar: torch.Tensor, *unused: torch.Tensor
+) -> tuple[torch.Tensor | None, ...]:
+    need_volume, _, need_matrices, need_factors, *_ = ctx.needs_input_grad
+    volume_bar, matrices_bar, factors_bar = _propagate_backward(
+        total_bar, moving_bar, *ctx.saved_tensors, need_matrices, need_factors
+    )
     return (
         volume_bar if need_volume else None,
         None,
         matrices_bar if need_matrices else None,
         factors_bar if need_factors else None,
-        None,
-        None,
+        *[None] * 3,
     )
 
 
@@ -134,9 +141,12 @@ _propagate.register_autograd(_backward, setup_context=_setup)
 
 
 def propagate_convolution(
-    volume: torch.Tensor, offsets: np.ndarray, matrices: torch.Tensor, factors: torch.Tensor, *, tolerance: float
-) -> torch.Tensor:
-    """``difflpv.propagation.propagate`` for a linear stencil; arguments validated there, ``factors`` is [steps]."""
+    volume: torch.Tensor, offsets: np.ndarray, matrices: torch.Tensor, factors: torch.Tensor, *, tolerance: float, moving: bool
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """``difflpv.propagation`` for a linear stencil; arguments validated there, ``factors`` is [steps].
+
+    Returns the accumulated volume and the moving one (empty unless ``moving``).
+    """
     keep = torch.is_grad_enabled() and (matrices.requires_grad or factors.requires_grad)
     cells = torch.as_tensor(np.array(offsets), device=volume.device)
-    return _propagate(volume, cells, matrices.contiguous(), factors.contiguous(), float(tolerance), keep)[0]
+    return _propagate(volume, cells, matrices.contiguous(), factors.contiguous(), float(tolerance), keep, moving)[:2]

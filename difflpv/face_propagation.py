@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from difflpv.bridge import as_warp, refuse_second_derivative, warp_scalar
-from difflpv.padded import Layout, SlabLauncher, Spans, kept_volumes, march, steps_back, volumes_between
+from difflpv.padded import Layout, SlabLauncher, Spans, kept_volumes, last_bar, march, steps_back, volumes_between
 from difflpv.stencil import FaceStencil
 from warp_kernels.propagation import CPU_LANES, adjoint_kernel, forward_kernel
 
@@ -124,26 +124,31 @@ def _rows(layout: Layout) -> int:
 def _propagate(
     volume: torch.Tensor, factors: torch.Tensor, transmittance: torch.Tensor, offsets: torch.Tensor, axis: torch.Tensor,
     weights: torch.Tensor, lobes: torch.Tensor, clamp: bool, occlude_first_step: bool, tolerance: float, keep: int,
-    read_box: Sequence[int],
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
+    read_box: Sequence[int], want_moving: bool,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
     layout = Layout.of(volume, CPU_LANES)
     steps = _Steps(layout, factors, transmittance, offsets, axis, weights, lobes, clamp, occlude_first_step)
     spans = Spans(layout, volume, len(factors), read_box, groups=layout.channels // _group(layout))
-    total, states, done = march(layout, volume, len(factors), keep, tolerance, steps.forward, spans)
+    total, moving, states, done = march(layout, volume, len(factors), keep, tolerance, steps.forward, spans)
     steps.launcher.release()
-    return layout.unpad(total), states, torch.tensor(done)
+    rest = layout.unpad(moving) if want_moving else volume.new_empty(0)
+    return layout.unpad(total), rest, states, torch.tensor(done)
 
 
 @_propagate.register_fake
-def _(volume, factors, transmittance, offsets, axis, weights, lobes, clamp, occlude_first_step, tolerance, keep, read_box):
-    layout = Layout.of(volume, CPU_LANES)
-    states = kept_volumes(layout, volume, len(factors), keep)
-    return torch.empty_like(volume, memory_format=torch.contiguous_format), states, torch.empty((), dtype=torch.int64)
+def _(
+    volume, factors, transmittance, offsets, axis, weights, lobes, clamp, occlude_first_step, tolerance, keep, read_box,
+    want_moving,
+):  # fmt: skip
+    states = kept_volumes(Layout.of(volume, CPU_LANES), volume, len(factors), keep)
+    total = torch.empty_like(volume, memory_format=torch.contiguous_format)
+    rest = torch.empty_like(total) if want_moving else volume.new_empty(0)
+    return total, rest, states, torch.empty((), dtype=torch.int64)
 
 
 @torch.library.custom_op("difflpv::propagate_faces_backward", mutates_args=())
 def _propagate_backward(
-    accumulated_bar: torch.Tensor, states: torch.Tensor, done: torch.Tensor, factors: torch.Tensor,
+    accumulated_bar: torch.Tensor, moving_bar: torch.Tensor, states: torch.Tensor, done: torch.Tensor, factors: torch.Tensor,
     transmittance: torch.Tensor, offsets: torch.Tensor, axis: torch.Tensor, weights: torch.Tensor, lobes: torch.Tensor,
     clamp: bool, occlude_first_step: bool, keep: int, need_factors: bool, need_transmittance: bool,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
@@ -151,6 +156,7 @@ def _propagate_backward(
     fields = layout.fields
     steps = _Steps(layout, factors, transmittance, offsets, axis, weights, lobes, clamp, occlude_first_step)
     total_bar, volume_bar = layout.pad(accumulated_bar), layout.empty(fields, accumulated_bar)
+    end_bar = last_bar(layout, accumulated_bar, moving_bar, total_bar)
     lobe_bar = layout.empty(layout.channels * len(lobes), accumulated_bar)
     lobe_bar_next = torch.zeros_like(lobe_bar)
     # the kernel that makes the transmittance's gradient writes the factors' too
@@ -159,10 +165,10 @@ def _propagate_backward(
     transmittance_bar = layout.empty(faces, accumulated_bar) if faces else accumulated_bar.new_empty(0)
     count = int(done)
     if count == 0:
-        volume_bar = total_bar
+        volume_bar = end_bar
     else:
         none = accumulated_bar.new_empty(0)
-        steps.adjoint(total_bar, lobe_bar_next, lobe_bar, total_bar, volume_bar, none, none, count - 1, start=True)
+        steps.adjoint(total_bar, lobe_bar_next, lobe_bar, end_bar, volume_bar, none, none, count - 1, start=True)
     for step, before in steps_back(layout, states, len(factors), count, keep, steps.forward):
         moving = total_bar if before is None else before
         steps.adjoint(moving, lobe_bar, lobe_bar_next, total_bar, volume_bar, transmittance_bar, factor_bar, step)
@@ -179,8 +185,8 @@ def _propagate_backward(
 
 @_propagate_backward.register_fake
 def _(
-    accumulated_bar, states, done, factors, transmittance, offsets, axis, weights, lobes, clamp, occlude_first_step, keep,
-    need_factors, need_transmittance,
+    accumulated_bar, moving_bar, states, done, factors, transmittance, offsets, axis, weights, lobes, clamp, occlude_first_step,
+    keep, need_factors, need_transmittance,
 ):  # fmt: skip
     passed = torch.empty_like(transmittance) if need_transmittance else accumulated_bar.new_empty(0)
     return torch.empty_like(accumulated_bar), accumulated_bar.new_empty(len(factors) if need_factors else 0), passed
@@ -191,23 +197,25 @@ refuse_second_derivative("propagate", _propagate_backward)
 
 def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[torch.Tensor, ...]) -> None:
     _, factors, transmittance, offsets, axis, weights, lobes, *flags = inputs
-    _, states, done = output
+    _, _, states, done = output
     ctx.mark_non_differentiable(states, done)
     ctx.save_for_backward(states, done, factors, transmittance, offsets, axis, weights, lobes)
-    ctx.clamp, ctx.occlude_first_step, _, ctx.keep, _ = flags
+    ctx.clamp, ctx.occlude_first_step, _, ctx.keep, *_ = flags
 
 
-def _backward(ctx: Any, accumulated_bar: torch.Tensor, *unused: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
+def _backward(
+    ctx: Any, accumulated_bar: torch.Tensor, moving_bar: torch.Tensor, *unused: torch.Tensor
+) -> tuple[torch.Tensor | None, ...]:
     need_volume, need_factors, need_transmittance = ctx.needs_input_grad[:3]
     volume_bar, factor_bar, transmittance_bar = _propagate_backward(
-        accumulated_bar.contiguous(), *ctx.saved_tensors, ctx.clamp, ctx.occlude_first_step, ctx.keep, need_factors,
-        need_transmittance,
+        accumulated_bar.contiguous(), moving_bar.contiguous(), *ctx.saved_tensors, ctx.clamp, ctx.occlude_first_step, ctx.keep,
+        need_factors, need_transmittance,
     )  # fmt: skip
     return (
         volume_bar if need_volume else None,
         factor_bar if need_factors else None,
         transmittance_bar if need_transmittance else None,
-        *[None] * 9,
+        *[None] * 10,
     )
 
 
@@ -225,8 +233,12 @@ def propagate_faces(
     tolerance: float,
     checkpoint_every: int | None,
     read_box: Sequence[int] = (),
-) -> torch.Tensor:
-    """``difflpv.propagation.propagate`` on the Warp kernels; arguments validated there, ``factors`` is [steps]."""
+    moving: bool = False,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """``difflpv.propagation`` on the Warp kernels; arguments validated there, ``factors`` is [steps].
+
+    Returns the accumulated volume and the moving one (empty unless ``moving``).
+    """
     passed = volume.new_ones((0, *volume.shape[2:])) if transmittance is None else transmittance
     learned = torch.is_grad_enabled() and (factors.requires_grad or passed.requires_grad)
     needs = learned or (clamp and torch.is_grad_enabled() and volume.requires_grad)
@@ -251,4 +263,5 @@ def propagate_faces(
         float(tolerance),
         keep,
         list(read_box),
-    )[0]
+        moving,
+    )[:2]

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from difflpv.bridge import as_warp, refuse_second_derivative, warp_scalar
-from difflpv.padded import Layout, SlabLauncher, Spans, kept_volumes, march, steps_back, volumes_between
+from difflpv.padded import Layout, SlabLauncher, Spans, kept_volumes, last_bar, march, steps_back, volumes_between
 from difflpv.stencil import pair_offsets
 from warp_kernels.linear_propagation import cpu_lanes, matrices_kernel, step_kernel
 
@@ -150,32 +150,36 @@ def _mirrored(weights: torch.Tensor) -> bool:
 @torch.library.custom_op("difflpv::propagate_pairs", mutates_args=())
 def _propagate(
     volume: torch.Tensor, matrices: torch.Tensor, factors: torch.Tensor, transmittance: torch.Tensor, offsets: torch.Tensor,
-    occlude_first_step: bool, tolerance: float, keep: int, read_box: Sequence[int],
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
+    occlude_first_step: bool, tolerance: float, keep: int, read_box: Sequence[int], want_moving: bool,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
     layout = _layout(volume)
     steps = _Steps(layout, matrices, factors, transmittance, offsets, occlude_first_step)
     spans = Spans(layout, volume, len(factors), read_box)
-    total, states, done = march(layout, volume, len(factors), keep, tolerance, steps.forward, spans)
+    total, moving, states, done = march(layout, volume, len(factors), keep, tolerance, steps.forward, spans)
     steps.launcher.release()
-    return layout.unpad(total), states, torch.tensor(done)
+    rest = layout.unpad(moving) if want_moving else volume.new_empty(0)
+    return layout.unpad(total), rest, states, torch.tensor(done)
 
 
 @_propagate.register_fake
-def _(volume, matrices, factors, transmittance, offsets, occlude_first_step, tolerance, keep, read_box):
+def _(volume, matrices, factors, transmittance, offsets, occlude_first_step, tolerance, keep, read_box, want_moving):
     states = kept_volumes(_layout(volume), volume, len(factors), keep)
-    return torch.empty_like(volume, memory_format=torch.contiguous_format), states, torch.empty((), dtype=torch.int64)
+    total = torch.empty_like(volume, memory_format=torch.contiguous_format)
+    rest = torch.empty_like(total) if want_moving else volume.new_empty(0)
+    return total, rest, states, torch.empty((), dtype=torch.int64)
 
 
 @torch.library.custom_op("difflpv::propagate_pairs_backward", mutates_args=())
 def _propagate_backward(
-    total_bar: torch.Tensor, states: torch.Tensor, done: torch.Tensor, matrices: torch.Tensor, factors: torch.Tensor,
-    transmittance: torch.Tensor, offsets: torch.Tensor, occlude_first_step: bool, keep: int, need_matrices: bool,
-    need_factors: bool, need_transmittance: bool,
+    total_bar: torch.Tensor, moving_bar: torch.Tensor, states: torch.Tensor, done: torch.Tensor, matrices: torch.Tensor,
+    factors: torch.Tensor, transmittance: torch.Tensor, offsets: torch.Tensor, occlude_first_step: bool, keep: int,
+    need_matrices: bool, need_factors: bool, need_transmittance: bool,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
     layout = _layout(total_bar)
     steps = _Steps(layout, matrices, factors, transmittance, offsets, occlude_first_step)
     source = layout.pad(total_bar)
-    after, scratch = source, [layout.empty(layout.fields, total_bar) for _ in range(2)]
+    after = last_bar(layout, total_bar, moving_bar, source)
+    scratch = [layout.empty(layout.fields, total_bar) for _ in range(2)]
     factor_bar = total_bar.new_zeros(len(factors) * layout.z * layout.y if need_factors else 0)
     pairs = len(transmittance) if need_transmittance else 0
     passed_bar = layout.empty(2 * pairs, total_bar) if pairs else total_bar.new_empty(0)
@@ -196,8 +200,8 @@ def _propagate_backward(
 
 @_propagate_backward.register_fake
 def _(
-    total_bar, states, done, matrices, factors, transmittance, offsets, occlude_first_step, keep, need_matrices, need_factors,
-    need_transmittance,
+    total_bar, moving_bar, states, done, matrices, factors, transmittance, offsets, occlude_first_step, keep, need_matrices,
+    need_factors, need_transmittance,
 ):  # fmt: skip
     def like(tensor: torch.Tensor, needed: bool) -> torch.Tensor:
         return torch.empty_like(tensor) if needed else total_bar.new_empty(0)
@@ -211,17 +215,19 @@ refuse_second_derivative("propagate", _propagate_backward)
 
 
 def _setup(ctx: Any, inputs: tuple[Any, ...], output: tuple[torch.Tensor, ...]) -> None:
-    _, matrices, factors, transmittance, offsets, occlude_first_step, _, keep, _ = inputs
-    _, states, done = output
+    _, matrices, factors, transmittance, offsets, occlude_first_step, _, keep, *_ = inputs
+    _, _, states, done = output
     ctx.mark_non_differentiable(states, done)
     ctx.save_for_backward(states, done, matrices, factors, transmittance, offsets)
     ctx.occlude_first_step, ctx.keep = occlude_first_step, keep
 
 
-def _backward(ctx: Any, total_bar: torch.Tensor, *unused: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-    needs = ctx.needs_input_grad[:4]
-    bars = _propagate_backward(total_bar.contiguous(), *ctx.saved_tensors, ctx.occlude_first_step, ctx.keep, *needs[1:])
-    return (*(bar if need else None for bar, need in zip(bars, needs, strict=True)), *[None] * 5)
+def _backward(
+    ctx: Any, total_bar: torch.Tensor, moving_bar: torch.Tensor, *unused: torch.Tensor
+) -> tuple[torch.Tensor | None, ...]:
+    needs, given = ctx.needs_input_grad[:4], (total_bar.contiguous(), moving_bar.contiguous())
+    bars = _propagate_backward(*given, *ctx.saved_tensors, ctx.occlude_first_step, ctx.keep, *needs[1:])
+    return (*(bar if need else None for bar, need in zip(bars, needs, strict=True)), *[None] * 6)
 
 
 _propagate.register_autograd(_backward, setup_context=_setup)
@@ -238,8 +244,12 @@ def propagate_pairs(
     tolerance: float,
     checkpoint_every: int | None,
     read_box: Sequence[int] = (),
-) -> torch.Tensor:
-    """``difflpv.propagation.propagate`` for a linear stencil on the Warp kernels; validated there, ``factors`` is [steps]."""
+    moving: bool = False,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """``difflpv.propagation`` for a linear stencil on the Warp kernels; validated there, ``factors`` is [steps].
+
+    Returns the accumulated volume and the moving one (empty unless ``moving``).
+    """
     passed = volume.new_ones((0, *volume.shape[2:])) if transmittance is None else transmittance
     learned = matrices.requires_grad or factors.requires_grad or passed.requires_grad
     keep = 0
@@ -255,4 +265,5 @@ def propagate_pairs(
         float(tolerance),
         keep,
         list(read_box),
-    )[0]
+        moving,
+    )[:2]

@@ -5,9 +5,9 @@ ceil(n_x / lanes) lanes + 2 and ``lanes`` spare elements at the end. The halo of
 bounds checks and may read ``lanes`` cells at once. (Rows that start on vector boundaries were slower: their margins cost more
 memory than aligned access saves.)
 
-Adjoint of A = sum_i S_i with S_{i+1} = F_i(S_i): G_N = Abar, G_i = Abar + (dF_i/dS)^T G_{i+1}, and the volume's gradient
-is G_0. Volumes are kept only where that derivative or a learnable of the propagation needs them. Without any a solve holds
-three: the moving one, the next one, their sum.
+Adjoint of A = sum_i S_i with S_{i+1} = F_i(S_i): G_N = Abar (and the cotangent of S_N, where that is asked for too),
+G_i = Abar + (dF_i/dS)^T G_{i+1}, and the volume's gradient is G_0. Volumes are kept only where that derivative or a
+learnable of the propagation needs them. Without any a solve holds three: the moving one, the next one, their sum.
 
 On the CPU a step leaves out cells that no light has reached and cells that can no longer reach what is read
 (``warp_kernels.row_spans``); ``Spans`` holds what it needs for that.
@@ -27,7 +27,7 @@ import torch
 
 from difflpv.bridge import as_warp, record, replay
 
-__all__ = ["Forward", "Layout", "SlabLauncher", "Spans", "kept_volumes", "march", "steps_back", "volumes_between"]
+__all__ = ["Forward", "Layout", "SlabLauncher", "Spans", "kept_volumes", "last_bar", "march", "steps_back", "volumes_between"]
 
 _KEEP_ALL_BYTES = 2**30
 
@@ -195,8 +195,8 @@ def kept_volumes(layout: Layout, like: torch.Tensor, steps: int, keep: int) -> t
 
 def march(
     layout: Layout, volume: torch.Tensor, steps: int, keep: int, tolerance: float, forward: Forward, spans: Spans
-) -> tuple[torch.Tensor, torch.Tensor, int]:
-    """All steps: padded accumulated intensity, the kept volumes, and how many steps were taken."""
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, int]:
+    """All steps: padded accumulated and moving intensity, the kept volumes, and how many steps were taken."""
     fields = layout.fields
     states = kept_volumes(layout, volume, steps, keep)
     for i, state in enumerate(states):  # zeroing all of it would cost as much as a step
@@ -218,9 +218,14 @@ def march(
         if tolerance:
             moving = injected if step == 0 else flux(home(step)) if volume.is_cuda else float(spans.moved.sum())
             if moving <= tolerance * injected:
-                return total, states, step
+                return total, home(step), states, step
         forward(home(step), home(step + 1), total, step, spans)
-    return total, states, steps
+    return total, home(steps), states, steps
+
+
+def last_bar(layout: Layout, total_bar: torch.Tensor, moving_bar: torch.Tensor, padded: torch.Tensor) -> torch.Tensor:
+    """Padded G_N: ``padded``, that of the accumulated volume, with that of the moving one unless this is empty."""
+    return layout.pad(total_bar + moving_bar) if moving_bar.numel() else padded
 
 
 def steps_back(

@@ -19,7 +19,7 @@ from difflpv.illumination import Illumination, LightValues, Receivers
 from difflpv.injection import InjectionReport, inject
 from difflpv.learnables import describe_learnables, fixed_values
 from difflpv.parameters import Parameter
-from difflpv.propagation import propagate
+from difflpv.propagation import propagate, propagate_moving
 from difflpv.sampling import sample_irradiance
 from difflpv.scene import Scene
 from difflpv.sh import cosine_lobe
@@ -181,14 +181,13 @@ class Lpv(torch.nn.Module):
         With ``receivers`` only what they read is complete: what nobody reads is left out.
         """
         boxes = () if receivers is None else receivers.boxes
-        volume, moved = self._start(illumination, values, boxes)
-        first, steps = self.config.fine_steps, self.config.steps
-        solved = moved(volume, 0, 0, first)
+        volume, options = self._start(illumination, values, boxes)
+        stencil, first, steps = self.config.stencil, self.config.fine_steps, self.config.steps
         if first == steps:
-            return (solved,)
-        # what a step adds is what still moves: it is read where it goes on, in the coarse cells
-        before = moved(volume, 0, 0, first - 1)
-        return before, moved(coarsen(solved - before), 1, first, steps)
+            return (propagate(volume, stencil, **options(0, 0, steps)),)
+        # what still moves is read where it goes on, in the coarse cells
+        solved, rest = propagate_moving(volume, stencil, **options(0, 0, first))
+        return solved - rest, propagate(coarsen(rest), stencil, **options(1, first, steps))
 
     def moving(
         self, illumination: Illumination, values: Mapping[str, torch.Tensor] | None = None
@@ -198,11 +197,11 @@ class Lpv(torch.nn.Module):
         The volumes on each grid add up to what ``accumulate`` returns for it, where the configuration's ``tolerance`` is 0;
         S_i with i >= ``config.fine_steps`` (where that is below ``config.steps``) is on the coarser grid.
         """
-        light, moved = self._start(illumination, values)
-        first, steps = self.config.fine_steps, self.config.steps
+        light, options = self._start(illumination, values)
+        stencil, first, steps = self.config.stencil, self.config.fine_steps, self.config.steps
         yield light
         for step in range(steps):
-            light = moved(light, int(step >= first), step, step + 1) - light
+            light = propagate_moving(light, stencil, **options(int(step >= first), step, step + 1))[1]
             if step + 1 == first < steps:
                 light = coarsen(light)
             yield light
@@ -212,8 +211,8 @@ class Lpv(torch.nn.Module):
         illumination: Illumination,
         values: Mapping[str, torch.Tensor] | None,
         boxes: Sequence[Sequence[int]] = (),
-    ) -> tuple[torch.Tensor, Callable[[torch.Tensor, int, int, int], torch.Tensor]]:
-        """The injected volume, and ``moved(light, level, begin, end)``: the sum of light over steps on one of the grids."""
+    ) -> tuple[torch.Tensor, Callable[[int, int, int], dict[str, Any]]]:
+        """The injected volume, and ``options(level, begin, end)`` of ``propagate`` for those steps on one of the grids."""
         if illumination.grid != self.grid:
             raise ValueError(f"illumination: expected one made for {self.grid}, got {illumination.grid}")
         config = self.config
@@ -231,24 +230,22 @@ class Lpv(torch.nn.Module):
         factors = v["propagation"] * v["propagation_steps"]
         passing = cache(lambda level: self._transmittance(illumination, level, v))
 
-        def moved(light: torch.Tensor, level: int, begin: int, end: int) -> torch.Tensor:
-            return propagate(
-                light,
-                stencil,
-                steps=end - begin,
-                factor=factors[begin:end],
-                transmittance=passing(level),
+        def options(level: int, begin: int, end: int) -> dict[str, Any]:
+            return {
+                "steps": end - begin,
+                "factor": factors[begin:end],
+                "transmittance": passing(level),
                 # without blockers only a field of the cells acts there, which is no self-shadowing
-                occlude_first_step=bool(config.occlude_first_step) or begin > 0 or config.occlusion == "none",
-                clamp=config.clamp,
-                matrices=matrices,
-                tolerance=config.tolerance,
-                checkpoint_every=self.checkpoint_every,
+                "occlude_first_step": bool(config.occlude_first_step) or begin > 0 or config.occlusion == "none",
+                "clamp": config.clamp,
+                "matrices": matrices,
+                "tolerance": config.tolerance,
+                "checkpoint_every": self.checkpoint_every,
                 # light that goes on in coarser cells is read everywhere
-                read_box=boxes[level] if level < len(boxes) and end == config.steps else None,
-            )
+                "read_box": boxes[level] if level < len(boxes) and end == config.steps else None,
+            }
 
-        return volume, moved
+        return volume, options
 
     def _transmittance(
         self, illumination: Illumination, level: int, v: Mapping[str, torch.Tensor]

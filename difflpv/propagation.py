@@ -10,7 +10,7 @@ agree with ``difflpv.reference.propagation``, and a face stencil's linear part r
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 
@@ -20,7 +20,7 @@ from difflpv.face_propagation import propagate_faces
 from difflpv.linear_propagation import propagate_pairs
 from difflpv.stencil import FaceStencil, LinearStencil
 
-__all__ = ["Backend", "propagate"]
+__all__ = ["Backend", "propagate", "propagate_moving"]
 
 Backend = Literal["auto", "warp", "conv3d"]
 
@@ -71,6 +71,37 @@ def propagate(
 
     Source: Kaplanyan and Dachsbacher 2010, section 4.2; HOLPV thesis sections 3.2.3 and 4.2.
     """
+    return _propagate(
+        volume, stencil, moving=False, steps=steps, factor=factor, transmittance=transmittance,
+        occlude_first_step=occlude_first_step, clamp=clamp, matrices=matrices, tolerance=tolerance,
+        checkpoint_every=checkpoint_every, read_box=read_box, backend=backend,
+    )[0]  # fmt: skip
+
+
+def propagate_moving(
+    volume: torch.Tensor, stencil: FaceStencil | LinearStencil, *, steps: int, **options: Any
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """``propagate``, and what still moves afterwards, in one pass; differentiable in both.
+
+    Args:
+        volume: as for ``propagate``.
+        stencil: as for ``propagate``.
+        steps: as for ``propagate``.
+        **options: of ``propagate``.
+
+    Returns:
+        Accumulated intensity S_0 + .. + S_n and the moving S_n [W/sr], n being the steps taken (``steps``, unless
+        ``tolerance`` ended them), each of the shape of ``volume``.
+    """
+    return _propagate(volume, stencil, moving=True, steps=steps, **options)
+
+
+def _propagate(
+    volume: torch.Tensor, stencil: FaceStencil | LinearStencil, *, moving: bool, steps: int,
+    factor: float | torch.Tensor = 1.0, transmittance: torch.Tensor | None = None, occlude_first_step: bool = False,
+    clamp: bool | None = None, matrices: torch.Tensor | None = None, tolerance: float = 0.0,
+    checkpoint_every: int | None = None, read_box: Sequence[int] | None = None, backend: Backend = "auto",
+) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
     check_float("volume", volume)
     if volume.ndim != 5:
         raise ValueError(f"volume: expected shape [C, K, n_z, n_y, n_x], got {list(volume.shape)}")
@@ -92,7 +123,7 @@ def propagate(
             raise ValueError(f"clamp: stencil '{stencil.name}' is linear, it has none")
         return _linear(
             volume, stencil, matrices, factors, transmittance, occlude_first_step=occlude_first_step, tolerance=tolerance,
-            checkpoint_every=checkpoint_every, box=box, backend=backend,
+            checkpoint_every=checkpoint_every, box=box, backend=backend, moving=moving,
         )  # fmt: skip
     if matrices is not None:
         raise ValueError(f"matrices: only a linear stencil takes them, got a face stencil '{stencil.name}'")
@@ -101,7 +132,7 @@ def propagate(
     if backend == "conv3d":
         if transmittance is not None or clamp:
             raise ValueError("backend: conv3d has neither clamp nor occlusion; use 'auto' or 'warp'")
-        return _linear(volume, stencil.linear_part, None, factors, None, tolerance=tolerance, backend=backend)
+        return _linear(volume, stencil.linear_part, None, factors, None, tolerance=tolerance, backend=backend, moving=moving)
     return propagate_faces(
         volume,
         stencil,
@@ -112,6 +143,7 @@ def propagate(
         tolerance=tolerance,
         checkpoint_every=checkpoint_every,
         read_box=box,
+        moving=moving,
     )
 
 
@@ -145,8 +177,8 @@ def _check_transmittance(transmittance: torch.Tensor | None, fields: int, volume
 def _linear(
     volume: torch.Tensor, stencil: LinearStencil, matrices: torch.Tensor | None, factors: torch.Tensor,
     transmittance: torch.Tensor | None, *, occlude_first_step: bool = False, tolerance: float,
-    checkpoint_every: int | None = None, box: Sequence[int] = (), backend: Backend,
-) -> torch.Tensor:  # fmt: skip
+    checkpoint_every: int | None = None, box: Sequence[int] = (), backend: Backend, moving: bool,
+) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
     if matrices is None:
         matrices = torch.as_tensor(stencil.matrices, dtype=volume.dtype, device=volume.device)
     check_float("matrices", matrices, like=volume)
@@ -159,7 +191,7 @@ def _linear(
         if backend == "conv3d":
             raise ValueError("backend: conv3d has no occlusion; use 'auto' or 'warp'")
     if backend == "conv3d":
-        return propagate_convolution(volume, stencil.offsets, matrices, factors, tolerance=tolerance)
+        return propagate_convolution(volume, stencil.offsets, matrices, factors, tolerance=tolerance, moving=moving)
     return propagate_pairs(
         volume,
         stencil.offsets,
@@ -170,4 +202,5 @@ def _linear(
         tolerance=tolerance,
         checkpoint_every=checkpoint_every,
         read_box=box,
+        moving=moving,
     )

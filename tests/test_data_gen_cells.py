@@ -52,7 +52,8 @@ def test_a_volume_is_traced_once_and_known_by_scene_lights_grid_and_component(tm
     monkeypatch.setattr("data_gen.cells.trace_volume", None)
     again = kept_volume(tmp_path, scene, GRID, "bounce1")
     assert again.spp == 64 and np.array_equal(again.halves, find_volume(tmp_path, scene, GRID, "bounce1").halves)
-    for other in ((_dimmer(scene), GRID, "bounce1"), (scene, GRID, "direct"), (scene, Grid(GRID.minimum, 0.3, (3, 2, 3)), "bounce1")):
+    finer = Grid(GRID.minimum, 0.3, GRID.resolution)
+    for other in ((_dimmer(scene), GRID, "bounce1"), (scene, GRID, "direct"), (scene, finer, "bounce1")):
         assert find_volume(tmp_path, *other) is None
     (file,) = tmp_path.iterdir()
     file.write_bytes(file.read_bytes()[:200])

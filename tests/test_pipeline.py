@@ -118,7 +118,7 @@ def test_two_cell_sizes_read_both_grids_and_carry_the_rest_on():
         Lpv(GRID, LpvConfig(method="learned_4x6", steps=n)).accumulate(light)[0] for n in (1, 2)
     )
     moving = two - one
-    assert torch.equal(fine, one)
+    torch.testing.assert_close(fine, one, rtol=1e-5, atol=1e-6 * float(one.abs().max()))
     padded = torch.nn.functional.pad(moving, [v for n in reversed(moving.shape[2:]) for v in (0, n % 2)])
     sums = sum(padded[:, :, i::2, j::2, k::2] for i in (0, 1) for j in (0, 1) for k in (0, 1))
     rest = Lpv(GRID.coarser(), LpvConfig(method="learned_4x6", steps=3))
