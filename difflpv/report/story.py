@@ -45,8 +45,9 @@ def verdict(values: Mapping[str, Any]) -> str:
     floor = values["floor"]
     parts.append(
         f" The floor is {error['floor']:.3f}: the true light in the cells, path-traced and read by the learned stencil’s "
-        "lookup, which no propagation of second order on this grid can be expected to beat by much. Its own noise "
-        f"({floor['spp']} paths a cell) would alone measure {floor['noise']['test']:.3f}."
+        "lookup. No propagation of second order on this grid can be expected to beat it by much; a fit can a little, because "
+        f"fitted gains mend some of what the lookup loses. Its own noise ({floor['spp']} paths a cell) would alone measure "
+        f"{floor['noise']['test']:.3f}."
     )
     published = _test_row(values, base)
     parts.append(f" against {' and '.join(against)}; a perfect method would measure {noise:.3f}, the noise of the targets.")
