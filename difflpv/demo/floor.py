@@ -10,7 +10,7 @@ import numpy as np
 
 from data_gen.cells import kept_volumes
 from difflpv.demo.settings import DemoSettings
-from difflpv.evaluate import Score, score
+from difflpv.evaluate import Score, relative_noise, score
 from difflpv.fit import LightTarget
 from difflpv.simulate import read_volume
 
@@ -43,8 +43,7 @@ def judge_floor(
         x, n, truth, weight = (a.double().cpu().numpy() for a in arrays)
         read = read_volume(volume.mean, target.illumination, x, n)
         off = read_volume(volume.halves[0], target.illumination, x, n) - read
-        area = weight[:, None]
-        noise[k] = float(np.sqrt((area * off**2).sum() / (area * truth**2).sum()))
+        noise[k] = relative_noise(off, truth, weight)
         scores.append(score(read, truth, weight, method="floor", component=first.component, light=k))
     splits = {"train": settings.train, "test": settings.test}
     means = {split: float(np.mean([noise[k] for k in own])) for split, own in splits.items()}
