@@ -27,6 +27,7 @@ _TRAINED = 32  # cells: learned stencils were trained to 16, and hold out to twi
 _THIN_SHARE = 0.02  # of the receivers
 _PROBED = 512  # receivers whose surroundings are looked at
 _HIGH_ALBEDO = 0.9
+_ASKED_VPLS = 32  # whether they light the other side of a wall
 
 
 def describe_trouble(
@@ -57,6 +58,8 @@ def describe_trouble(
 def free_space(light: Illumination, position: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Free space in front of receivers and matter behind them, along the normal [m], [n] each; inf where a ray meets nothing.
 
+    A wall of one sheet has 0 m of matter: some of the VPLs light its other side, which they cannot inside a solid.
+
     Args:
         light: holds the rays.
         position: on surfaces [n,3] m.
@@ -64,7 +67,21 @@ def free_space(light: Illumination, position: np.ndarray, normal: np.ndarray) ->
     """
     lift = light.raycaster.offset * normal
     front = light.raycaster.closest(position + lift, normal).distance
-    return front, light.raycaster.closest(position - lift, -normal).distance
+    behind = light.raycaster.closest(position - lift, -normal).distance
+    return front, np.where(_lit_behind(light, position - lift, normal), 0.0, behind)
+
+
+def _lit_behind(light: Illumination, behind: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """True where some VPLs light points [n,3] just behind surfaces with normals [n,3], bool [n]."""
+    vpls = light.vpls()
+    some = np.unique(np.linspace(0, max(len(vpls) - 1, 0), min(len(vpls), _ASKED_VPLS)).round().astype(int))
+    source, facing = (a.detach().cpu().double().numpy()[some] for a in (vpls.position, vpls.normal))
+    way = source - behind[:, None]
+    open_sides = ((way * -normal[:, None]).sum(-1) > 0) & ((-way * facing).sum(-1) > light.raycaster.offset)
+    lit = np.zeros(open_sides.shape, bool)
+    rows, columns = np.nonzero(open_sides)
+    lit[rows, columns] = ~light.raycaster.blocked(behind[rows], source[columns] + light.raycaster.offset * facing[columns])
+    return np.asarray(lit.any(1))
 
 
 def _lost(lpv: Lpv) -> str:

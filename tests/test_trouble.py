@@ -22,7 +22,8 @@ def room(*, edge=2.0, albedo=0.5, cells=8, divider=None):
     """A closed box with a panel under its ceiling and receivers on its floor; the grid has a cell of margin."""
     half = edge / 2
     box = box_scene(low=(-half,) * 3, high=(half,) * 3, albedo=np.full((6, 3), albedo))
-    lamp = rectangle("lamp", (-0.2 * half, 0.9 * half, -0.2 * half), (0.4 * half, 0, 0), (0, 0, 0.4 * half), (0, 0, 0))
+    x = -0.2 * half if divider is None else -0.7 * half  # on one side of a divider
+    lamp = rectangle("lamp", (x, 0.9 * half, -0.2 * half), (0.4 * half, 0, 0), (0, 0, 0.4 * half), (0, 0, 0))
     meshes = [*box.meshes, lamp]
     if divider is not None:  # two faces that look away from each other, across the room
         faces = ((divider / 2, "near"), (-divider / 2, "far"))
@@ -113,6 +114,24 @@ def test_free_space_is_measured_along_the_normal():
     front, behind = free_space(light, position, normal)
     np.testing.assert_allclose(front, [0.85, 0.85], atol=1e-4)
     np.testing.assert_allclose(behind, [0.3, np.inf], atol=1e-4)
+
+
+@pytest.mark.parametrize("component", ["direct", "bounce1"])
+def test_a_wall_of_one_sheet_has_no_thickness(component):
+    """Told of a lone quad across the room; not of outer walls, behind which there is nothing, nor of solids."""
+    scene, grid = room(divider=1e-6)
+    lone = replace(scene, meshes=tuple(m for m in scene.meshes if m.name != "far"))
+    place, normal = np.array([[0.0, 0.3, 0.4], [0, -1, 0.3]]), np.array([[1.0, 0, 0], [0, 1, 0]])
+    light = illuminate(lone, grid, LpvConfig(steps=1), component, **FEW)
+    x, n = np.repeat(place, 25, 0), np.repeat(normal, 25, 0)
+    np.testing.assert_allclose(free_space(light, place, normal)[1], [0, np.inf])
+    lpv = Lpv(grid, LpvConfig(steps=8))
+    lpv(light, light.receivers(x, n))
+    lines = describe_trouble(lpv, light, x, n, np.ones((50, 3)))
+    assert any("50 % of the receivers lie on less than a cell of matter (thinnest 0 m)" in line for line in lines)
+    solid, _ = room(divider=0.6)
+    light = illuminate(solid, grid, LpvConfig(steps=1), component, **FEW)
+    np.testing.assert_allclose(free_space(light, place + [[0.3, 0, 0], [0, 0, 0]], normal)[1], [0.6, np.inf], atol=1e-4)
 
 
 def test_negative_light_is_told_where_it_counts():
