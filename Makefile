@@ -26,7 +26,7 @@ help:
 	@echo "make demo     fit light propagation volumes to the Cornell box; report in out/demo/report.html"
 	@echo "make test     all tests (PYTEST_ARGS='tests/test_sh.py -x' for some of them)"
 	@echo "make lint     ruff and mypy"
-	@echo "make bench    speed, memory and accuracy on this machine"
+	@echo "make bench    speed, memory and accuracy on this machine, and what moved since benchmarks/baseline.json"
 	@echo "make install  only create .venv and install (PYTHON=python3.12 to choose the interpreter)"
 	@echo "make clean    remove .venv, build output and tool caches; keeps out/"
 
@@ -55,7 +55,7 @@ lint: $(STAMP)
 	$(RUN) -m mypy
 
 bench: $(STAMP)
-	@set -e; for program in benchmarks/*.py; do echo "== $$program"; $(RUN) "$$program"; done
+	$(RUN) benchmarks/baseline.py --out out/bench
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

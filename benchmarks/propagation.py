@@ -18,6 +18,7 @@ from collections.abc import Callable
 
 import torch
 
+from difflpv.bench.peers import convolution, convolution_weight
 from difflpv.bench.timing import interleaved
 from difflpv.propagation import propagate
 from difflpv.stencil import FaceStencil, LinearStencil, holpv_stencil, lpv_stencil
@@ -52,25 +53,6 @@ def torch_faces(volume: torch.Tensor, stencil: FaceStencil, factors: torch.Tenso
     return total
 
 
-def torch_convolution(volume: torch.Tensor, weight: torch.Tensor, factors: torch.Tensor) -> torch.Tensor:
-    """Autograd through conv3d, in the layout of ``weight``."""
-    last = weight.is_contiguous(memory_format=torch.channels_last_3d)
-    moving = total = volume.contiguous(memory_format=torch.channels_last_3d) if last else volume
-    for factor in factors:
-        moving = factor * torch.nn.functional.conv3d(moving, weight, padding=1)
-        total = total + moving
-    return total
-
-
-def convolution_weight(stencil: LinearStencil) -> torch.Tensor:
-    """conv3d's weight [K,K,3,3,3] of a linear stencil."""
-    coeffs = (stencil.l_max + 1) ** 2
-    weight = torch.zeros(coeffs, coeffs, 3, 3, 3)
-    for n, matrix in zip(stencil.offsets.tolist(), stencil.matrices, strict=True):
-        weight[:, :, 1 - n[2], 1 - n[1], 1 - n[0]] = torch.tensor(matrix, dtype=torch.float32)
-    return weight
-
-
 def measure_pairs(stencil: LinearStencil, cells: int, steps: int, repeats: int, device: torch.device) -> dict[str, float]:
     """A linear stencil with occlusion: its step against conv3d without, its gradients against its forward."""
     generator = torch.Generator().manual_seed(0)
@@ -86,7 +68,7 @@ def measure_pairs(stencil: LinearStencil, cells: int, steps: int, repeats: int, 
 
     def conv_forward() -> object:
         with torch.no_grad():
-            return torch_convolution(inputs["volume"], weight, inputs["factor"])
+            return convolution(inputs["volume"], weight, inputs["factor"])
 
     def forward() -> object:
         with torch.no_grad():
@@ -150,12 +132,12 @@ def measure(
 
     def conv_forward() -> object:
         with torch.no_grad():
-            return torch_convolution(volume, fast_weight, factors)
+            return convolution(volume, fast_weight, factors)
 
     calls: dict[str, Callable[[], object]] = {
         "conv3d forward": conv_forward,
-        "torch autograd through conv3d": both(lambda v, p: torch_convolution(v, fast_weight, p)),
-        "torch autograd through conv3d, contiguous": both(lambda v, p: torch_convolution(v, weight, p)),
+        "torch autograd through conv3d": both(lambda v, p: convolution(v, fast_weight, p)),
+        "torch autograd through conv3d, contiguous": both(lambda v, p: convolution(v, weight, p)),
         "linear on conv3d forward": forward(clamp=False, backend="conv3d"),
         "linear on conv3d both": ours(clamp=False, backend="conv3d"),
         "clamp forward": forward(),

@@ -60,7 +60,7 @@ def numbers(summary):
 def test_demo_writes_everything_and_tells_the_table(demo, told):
     out = demo.folder
     assert told[-1].startswith(f"\n{demo.table}") and str(demo.report) in told[-1]
-    assert {path.stem for path in (out / "figures").iterdir()} == {"renders", "convergence", "lights", "factors"}
+    assert {path.stem for path in (out / "figures").iterdir()} == {"renders", "convergence", "lights", "factors", "speed"}
     assert DemoSummary.read(out).values == demo.values
     assert [s.method for s in demo.test if s.component == "bounce1"] == [*run._IN_TABLE, "floor"]
     assert [s.method for s in demo.test if s.component == "direct"] == ["constant", "LPV", "HOLPV", "learned_9x26"]
@@ -75,8 +75,8 @@ def test_report_is_one_sound_file_with_the_numbers_of_the_summary(demo):
     rows = json.loads((demo.folder / "summary.json").read_text())["rows"]
     check_table(page, 0, [row for row in rows if row["component"] == "bounce1"])
     check_table(page, len(page.tables) - 1, [row for row in rows if row["component"] == "direct"])
-    assert len(page.images) == 4
-    for image, name in zip(page.images, ("renders", "convergence", "lights", "factors"), strict=True):
+    assert len(page.images) == 5
+    for image, name in zip(page.images, ("renders", "convergence", "lights", "speed", "factors"), strict=True):
         assert np.array_equal(image, Image.open(demo.folder / "figures" / f"{name}.png").convert("RGB"))
 
 

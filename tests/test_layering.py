@@ -163,7 +163,9 @@ LIBRARY_OWNERS: dict[str, tuple[str, ...]] = {
     "matplotlib": ("difflpv.report", "scripts"),
     "tqdm": ("data_gen", "difflpv.cli", "scripts"),
     "viser": ("difflpv.viewer.page",),
-    "mitsuba": (),
+    "flip_evaluator": ("difflpv.bench.images",),
+    "mitsuba": ("difflpv.bench.mitsuba_peer",),
+    "drjit": ("difflpv.bench.mitsuba_peer",),
 }
 
 # What every path-tracing worker and `difflpv --help` import: torch or Warp would cost each of them seconds.

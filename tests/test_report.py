@@ -8,6 +8,7 @@ import pytest
 from page_reader import Page, check_table
 from PIL import Image
 
+from difflpv.report.bench import draw_error_over_time, small_png
 from difflpv.report.figures import draw_convergence, draw_factors, draw_lights, draw_renders
 from difflpv.report.page import build_page, format_number
 from difflpv.report.story import limits, verdict
@@ -98,6 +99,11 @@ def figures():
         "renders": draw_renders(truth, {"LPV": truth, "HOLPV": 2 * truth}, hit, {"LPV": "a caption"}),
         "convergence": draw_convergence(values["fits"], 0.6),
         "lights": draw_lights(values["scores"], [0, 1], [2, 3], 0.05),
+        "speed": small_png(
+            draw_error_over_time(
+                [{"name": "a", "family": "learned", "error": 0.2, "seconds": 0.1}], ["a"], title="a", noise=0.1
+            )
+        ),
         "factors": draw_factors({"LPV fitted": [0.1, 1.5, 1.4], "HOLPV fitted": [0.7, 1.0, 1.1]}),
     }
 
@@ -108,7 +114,7 @@ def test_page_is_well_formed_and_shows_the_numbers(figures):
     check_table(page, 0, [row for row in values["rows"] if row["component"] == "bounce1"])
     check_table(page, len(page.tables) - 1, [row for row in values["rows"] if row["component"] == "direct"])
     assert page.tables[0][-1][:2] == ["noise of the targets", format_number(0.04)]
-    assert len(page.images) == 4
+    assert len(page.images) == 5
     assert page.headings[0].startswith("Light propagation volumes") and page.headings[-1] == "How to reproduce this"
 
 

@@ -15,7 +15,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from data_gen.few_paths import PathPool
 from difflpv.bench.configuration import Configuration
+from difflpv.bench.images import BenchView, image_errors
+from difflpv.bench.mitsuba_peer import MitsubaRun
 from difflpv.bench.scenes import BenchScene
 from difflpv.bench.timing import Timing, interleaved, peak_bytes
 from difflpv.bench.tracers import ConstantRun, PathRun
@@ -55,6 +58,8 @@ class Point:
         scaled_error: the same at the best single scale.
         percentile_95: 95th percentile of the error over the mean truth.
         leak: mean error in the dark region over the mean of the lit one; None where none is defined.
+        ssim: structural dissimilarity (1 - SSIM)/2 of the picture; None without a camera.
+        flip: mean FLIP of the picture; None without a camera or the package.
         receivers: how many.
         solve: time of one solve; None for what is no solve (constant, floor).
         lookup: time of reading the receivers; None where the solve has them already.
@@ -72,6 +77,8 @@ class Point:
     scaled_error: float
     percentile_95: float
     leak: float | None
+    ssim: float | None
+    flip: float | None
     receivers: int
     solve: Timing | None
     lookup: Timing | None
@@ -98,7 +105,12 @@ class Point:
 
 
 def prepare(
-    configuration: Configuration, scene: BenchScene, *, tuning: BenchScene | None = None, workers: int = 1
+    configuration: Configuration,
+    scene: BenchScene,
+    *,
+    tuning: BenchScene | None = None,
+    pool: PathPool | None = None,
+    cell_spp: int = 1024,
 ) -> BenchRun:
     """Everything up to the first solve.
 
@@ -106,16 +118,23 @@ def prepare(
         configuration: what to prepare.
         scene: where.
         tuning: the same scene with other receivers, for configurations that tune something.
-        workers: processes of the path tracer.
+        pool: path tracers of this scene that wait for work; one in this process by default.
+        cell_spp: paths per cell of the floor.
+
+    Raises:
+        ImportError: a library that this configuration needs is not there.
+        ValueError: no receivers to tune on, or a light that Mitsuba has not.
     """
     if configuration.kind == "constant":
         return ConstantRun(configuration, scene)
     if configuration.kind == "volume":
         return VolumeRun(configuration, scene, tuning=tuning)
     if configuration.kind == "floor":
-        return FloorRun(configuration, scene)
+        return FloorRun(configuration, scene, spp=cell_spp)
     if configuration.kind == "paths":
-        return PathRun(configuration, scene, workers=workers)
+        return PathRun(configuration, scene, pool or PathPool(scene.scene))
+    if configuration.kind == "mitsuba":
+        return MitsubaRun(configuration, scene)
     raise ValueError(f"configuration '{configuration.name}': no way to solve kind '{configuration.kind}'")
 
 
@@ -135,7 +154,9 @@ def measure(
     gradients: bool = True,
     memory: bool = True,
     tuning: BenchScene | None = None,
-    workers: int = 1,
+    view: BenchView | None = None,
+    pool: PathPool | None = None,
+    cell_spp: int = 1024,
     progress: Callable[[str], object] = lambda line: None,
 ) -> list[Point]:
     """Measure configurations on one scene; their repeats take turns.
@@ -148,43 +169,40 @@ def measure(
         gradients: time forward and backward too.
         memory: measure the peak memory of a solve too.
         tuning: the same scene with other receivers, for configurations that tune something.
-        workers: processes of the path tracer.
+        view: the picture of the scene, for SSIM and FLIP.
+        pool: path tracers of this scene that wait for work; one in this process by default.
+        cell_spp: paths per cell of the floor.
         progress: told the name of every configuration.
     """
     runs: dict[str, BenchRun] = {}
     found: dict[str, dict[str, float | None]] = {}
     calls: dict[str, Callable[[], object]] = {}
-    try:
-        for c in configurations:
-            progress(c.name)
-            run = runs[c.name] = prepare(c, scene, tuning=tuning, workers=workers)
-            solved = run.solve()
-            found[c.name] = errors(run.lookup(solved), scene)
-            if c.kind not in ("constant", "floor"):
-                calls[f"solve {c.name}"] = run.solve
-            if isinstance(run, VolumeRun):
-                calls[f"lookup {c.name}"] = lambda run=run, solved=solved: run.lookup(solved)  # type: ignore[misc]
-                if gradients and not isinstance(run, FloorRun):
-                    calls[f"both {c.name}"] = run.both
-        times = interleaved(calls, repeats, patience=patience)
-        points = []
-        for name, run in runs.items():
-            own = {part: times.get(f"{part} {name}") for part in ("solve", "lookup", "both")}
-            bytes_, volumes = None, None
-            if memory and run.configuration.kind in ("volume", "paths"):
-                bytes_ = peak_bytes(run.solve)
-                volumes = bytes_ / run.volume_bytes if isinstance(run, VolumeRun) else None
-            points.append(
-                Point(
-                    scene=scene.key, name=name, family=run.configuration.family, receivers=len(scene.position),
-                    setup_seconds=run.setup, lights_seconds=run.lights, memory_bytes=bytes_, memory_volumes=volumes,
-                    **found[name], **own,  # type: ignore[arg-type]
-                )
-            )  # fmt: skip
-        return points
-    finally:
-        for run in runs.values():
-            if isinstance(run, PathRun):
-                run.close()
-
-
+    for c in configurations:
+        progress(c.name)
+        run = runs[c.name] = prepare(c, scene, tuning=tuning, pool=pool, cell_spp=cell_spp)
+        solved = run.solve()
+        found[c.name] = {**errors(run.lookup(solved), scene), "ssim": None, "flip": None}
+        if view is not None:
+            found[c.name] |= image_errors(run, view, direct=scene.component == "direct")
+        if c.kind not in ("constant", "floor"):
+            calls[f"solve {c.name}"] = run.solve
+        if isinstance(run, VolumeRun):
+            calls[f"lookup {c.name}"] = lambda run=run, solved=solved: run.lookup(solved)  # type: ignore[misc]
+            if gradients and c.kind == "volume":
+                calls[f"both {c.name}"] = run.both
+    times = interleaved(calls, repeats, patience=patience)
+    points = []
+    for name, run in runs.items():
+        own = {part: times.get(f"{part} {name}") for part in ("solve", "lookup", "both")}
+        bytes_, volumes = None, None
+        if memory and isinstance(run, VolumeRun) and run.configuration.kind == "volume":
+            bytes_ = peak_bytes(run.solve)
+            volumes = bytes_ / run.volume_bytes
+        points.append(
+            Point(
+                scene=scene.key, name=name, family=run.configuration.family, receivers=len(scene.position),
+                setup_seconds=run.setup, lights_seconds=run.lights, memory_bytes=bytes_, memory_volumes=volumes,
+                **found[name], **own,  # type: ignore[arg-type]
+            )
+        )  # fmt: skip
+    return points

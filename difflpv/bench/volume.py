@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from data_gen.cells import true_volume
+from data_gen.cells import kept_volume
 from difflpv.bench.configuration import Configuration
 from difflpv.bench.scenes import BenchScene
 from difflpv.bench.timing import timed
 from difflpv.fit import fit, light_target
 from difflpv.illumination import Illumination, Receivers, illuminate
-from difflpv.io.tables import TableError, load_table, save_table
 from difflpv.loss import relative_l2
 from difflpv.pipeline import Lpv
 
@@ -93,15 +92,15 @@ class VolumeRun:
         """Irradiance [n,3] of the receivers, those of the scene if none are given."""
         return self.lpv.read(solved, self.receivers if receivers is None else receivers).numpy()
 
-    def both(self) -> Mapping[str, torch.Tensor]:
-        """Forward and backward of the error, with respect to intensity and position of every light."""
+    def both(self, receivers: Receivers | None = None) -> Mapping[str, torch.Tensor]:
+        """Gradient with respect to intensity and position of every light: of the error, or of other receivers' mean."""
         count = len(self.bench.scene.lights)
         leaves = {"light_intensity": torch.ones(count, requires_grad=True)}
         if self.config.deposit != "nearest":
             leaves["light_position"] = torch.zeros(count, 3, requires_grad=True)
-        irradiance = self.lpv(self.light, self.receivers, leaves)
-        error = relative_l2(irradiance, self._truth, self._weight)
-        found = torch.autograd.grad(error, list(leaves.values()), allow_unused=True)
+        irradiance = self.lpv(self.light, self.receivers if receivers is None else receivers, leaves)
+        aim = irradiance.mean() if receivers is not None else relative_l2(irradiance, self._truth, self._weight)
+        found = torch.autograd.grad(aim, list(leaves.values()), allow_unused=True)
         return {n: torch.zeros_like(v) if g is None else g for (n, v), g in zip(leaves.items(), found, strict=True)}
 
     def predict(self, position: np.ndarray, normal: np.ndarray) -> np.ndarray:
@@ -121,16 +120,10 @@ class FloorRun(VolumeRun):
     The volume is path traced once and kept beside the truth.
     """
 
-    def __init__(self, configuration: Configuration, bench: BenchScene) -> None:
+    def __init__(self, configuration: Configuration, bench: BenchScene, *, spp: int = 1024) -> None:
         super().__init__(configuration, bench)
-        made_for = f"{bench.component}_{self.grid.resolution[0]}_{bench.scene.hash[:12]}"
-        path = bench.folder / f"cells_{made_for}.npz"
-        try:
-            known = load_table(path)["volume"]
-        except (TableError, KeyError):
-            known = true_volume(bench.scene, self.grid, bench.component, seed=bench.seed).astype(np.float32)
-            save_table(path, volume=known)
-        self._known = (torch.as_tensor(known),)
+        known = kept_volume(bench.folder / "cells", bench.scene, self.grid, bench.component, spp=spp, seed=bench.seed)
+        self._known = (torch.as_tensor(known.mean, dtype=torch.float32),)
 
     def solve(self) -> tuple[torch.Tensor, ...]:
         """The known volume."""

@@ -16,6 +16,7 @@ from difflpv.config import LpvConfig, Method, grid_for
 from difflpv.demo.fits import fit_once
 from difflpv.demo.floor import judge_floor
 from difflpv.demo.settings import FITS, SCENE, UNFITTED, DemoSettings
+from difflpv.demo.speed import draw_speed
 from difflpv.demo.summary import (
     DemoSummary,
     code_digest,
@@ -161,7 +162,8 @@ def run_demo(
         "identity": identity,
         "seconds": 0.0,
     }
-    figures = _draw(values, views)
+    progress("timing every method on this machine")
+    figures = {**_draw(values, views), "speed": draw_speed(scene, targets, sizes.image_light, seed=seed)}
     values["seconds"] = round(time.perf_counter() - begun, 1)
     _write(folder, values, figures)
     summary = DemoSummary.read(folder)

@@ -8,11 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from data_gen.targets import make_targets
+from difflpv.bench import images
 from difflpv.camera_view import camera_view
 from difflpv.demo.settings import DemoSettings
 from difflpv.illumination import Illumination
-from difflpv.io.exr import read_image
 from difflpv.lights import LightEntry
 from difflpv.pipeline import Lpv
 from difflpv.scene import Camera, Scene
@@ -44,23 +43,8 @@ def trace_image(
     scene: Scene, entries: list[LightEntry], settings: DemoSettings, *, folder: Path, seed: int, workers: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Path-traced image [H,W,3] of the first bounce and its standard error [H,W,3], from ``folder`` if it lies there."""
-    small = replace(scene, cameras=(_camera(scene, settings),))
-    targets = make_targets(
-        small,
-        folder,
-        receiver_count=1,  # the receivers are not asked for here
-        components=("bounce1",),
-        spp=1,
-        light_sets=[entries],
-        images=True,
-        image_spp=settings.image_spp,
-        seed=seed,
-        workers=workers,
-        overwrite=True,
-    )
-    truth, noise = read_image(targets.lights[0].images["bounce1"])
-    assert noise is not None
-    return truth.astype(np.float64), noise.astype(np.float64)
+    sizes = {"width": settings.image_width, "height": settings.image_height, "spp": settings.image_spp}
+    return images.trace_picture(scene, folder, "bounce1", light_sets=[entries], seed=seed, workers=workers, **sizes)
 
 
 def render_views(

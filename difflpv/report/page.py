@@ -32,7 +32,7 @@ def build_page(values: Mapping[str, Any], figures: Mapping[str, bytes]) -> str:
 
     Args:
         values: the content of ``summary.json``.
-        figures: PNG files by name: renders, convergence, lights, factors.
+        figures: PNG files by name: renders, convergence, lights, factors, speed.
 
     Returns:
         A page that loads nothing from anywhere.
@@ -65,6 +65,15 @@ def build_page(values: Mapping[str, Any], figures: Mapping[str, bytes]) -> str:
             "Open marks: before any fit. Filled marks: fitted on the train lights. A fit that only remembered its lights "
             "would be better on the left than on the right.",
             "Error under each light",
+        ),
+        "<h2>Speed against accuracy</h2>",
+        _figure(
+            "speed",
+            figures,
+            "Untuned methods at the receivers of this page, timed on this machine: one solve with its lookup, set-up and rays "
+            "of the lights apart. A path tracer’s time grows with the receivers, a solve’s hardly: <code>difflpv bench</code> "
+            "measures from how many on a solve wins.",
+            "Error over time",
         ),
         "<h2>What was found</h2>",
         fitted_values(values),

@@ -1,0 +1,150 @@
+"""From how many receivers on a solve pays: time over their number at equal error, against path tracers.
+
+The cheapest learned configuration that meets ``EQUAL_ERROR`` is compared with as many paths per receiver as give the error
+that it has. Paths come in powers of two: their time is scaled from the nearest measured power, to which it is proportional.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from data_gen.few_paths import PathPool
+from difflpv.bench.configuration import LADDER, Configuration
+from difflpv.bench.measure import Point, prepare
+from difflpv.bench.mitsuba_peer import MitsubaRun, unavailable
+from difflpv.bench.scenes import BenchScene
+from difflpv.bench.settings import BenchSettings
+from difflpv.bench.timing import interleaved, timed
+from difflpv.bench.tracers import PathRun
+from difflpv.bench.volume import VolumeRun
+
+__all__ = ["EQUAL_ERROR", "crossing", "equal_paths", "measure_break_even"]
+
+EQUAL_ERROR = 0.2
+COUNTS = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000, 10_000_000)
+GRADIENT_COUNTS = (1_000, 10_000, 100_000)
+_MOST_PATHS = 1 << 20  # traced at a time: beyond that, time is proportional to receivers
+_CHUNK = 1 << 18
+
+
+def equal_paths(points: Sequence[Point], family: str, error: float) -> float | None:
+    """Paths per receiver at which a path tracer has this error, by log-log interpolation of its points; None without any.
+
+    Beyond its points noise falls as one over the root of the paths.
+    """
+    samples = {c.name: c.samples for c in LADDER}
+    own = sorted((samples[p.name] or 1, p.error) for p in points if p.family == family)
+    if not own:
+        return None
+    n, e = np.log([k for k, _ in own]), np.log([v for _, v in own])
+    if np.log(error) < e[-1]:
+        return float(np.exp(n[-1] + 2 * (e[-1] - np.log(error))))
+    return float(np.exp(np.interp(-np.log(error), -e, n)))
+
+
+def crossing(counts: Sequence[int], ours: Sequence[float], theirs: Sequence[float]) -> float | None:
+    """Number of receivers from which on ours is the faster one, by log-log interpolation; None where it never is."""
+    gap = np.log(theirs) - np.log(ours)
+    if gap[-1] <= 0:
+        return None
+    below = np.flatnonzero(gap <= 0)
+    if not len(below):
+        return float(counts[0])
+    k = below[-1]
+    share = -gap[k] / (gap[k + 1] - gap[k])
+    return float(np.exp(np.log(counts[k]) + share * (np.log(counts[k + 1]) - np.log(counts[k]))))
+
+
+def measure_break_even(
+    points: Sequence[Point], scene: BenchScene, settings: BenchSettings, *, pool: PathPool | None = None
+) -> dict[str, Any] | None:
+    """Time over receivers at equal error.
+
+    Args:
+        points: of this scene.
+        scene: where.
+        settings: sizes and repeats.
+        pool: path tracers of this scene that wait for work; one in this process by default.
+
+    Returns:
+        ``configuration``, ``error``, ``counts``, ``measured`` (the largest count that was), seconds of ``ours`` by
+        what has changed, ``peers`` with their paths, seconds, break-even and speed-up; None where nothing meets 0.2.
+    """
+    by_name = {c.name: c for c in LADDER}
+    # fit, geometry and sight belong to a scene, not to a solve: they are told apart, not counted here
+    able = [p for p in points if p.family == "learned" and p.error <= EQUAL_ERROR and p.solve is not None]
+    if not able:
+        return None
+    best = min(able, key=lambda p: (p.seconds or 0) + p.lights_seconds)
+    run = prepare(by_name[best.name], scene)
+    assert isinstance(run, VolumeRun)
+    counts = COUNTS
+    measured = [n for n in counts if n <= settings.most_receivers]
+    solved, rng = run.solve(), np.random.default_rng(scene.seed)
+    chunk = min(_CHUNK, measured[-1])
+    rows = rng.integers(0, len(scene.position), chunk)
+    seen, sight = timed(lambda: run.light.receivers(scene.position[rows], scene.normal[rows]))
+    parts = {n: run.light.receivers(scene.position[rows[:n]], scene.normal[rows[:n]]) for n in measured if n < chunk}
+    calls: dict[str, Any] = {"solve": run.solve, "lights": run.relight}
+    calls |= {f"lookup {n}": lambda part=part: run.lookup(solved, part) for n, part in parts.items()}
+    calls[f"lookup {chunk}"] = lambda: run.lookup(solved, seen)
+    for n in GRADIENT_COUNTS:
+        if n in parts or n == chunk:
+            own = parts.get(n, seen)
+            calls[f"both {n}"] = lambda own=own: run.both(own)
+    peers: dict[str, dict[str, Any]] = {}
+    tracers: dict[str, tuple[PathRun | MitsubaRun, int, int]] = {}
+    for family, kind in (("path tracer", "paths"), ("Mitsuba 3", "mitsuba")):
+        paths = equal_paths(points, family, best.error)
+        if paths is None or (kind == "mitsuba" and unavailable()):
+            continue
+        power = max(1, 1 << round(np.log2(paths)))
+        configuration = Configuration(family, kind, family, samples=power)  # type: ignore[arg-type]
+        tracer = prepare(configuration, scene, pool=pool)
+        assert isinstance(tracer, (PathRun, MitsubaRun))
+        most = max(1000, min(_MOST_PATHS // power, settings.most_receivers))
+        tracers[family] = (tracer, power, most)
+        peers[family] = {"paths": paths, "traced_paths": power}
+        for n in {n for n in measured if n <= most} | {most}:
+            pick = rng.integers(0, len(scene.position), n)
+            x, normal = scene.position[pick], scene.normal[pick]
+            calls[f"{family} {n}"] = lambda tracer=tracer, x=x, normal=normal: tracer.predict(x, normal)
+            if isinstance(tracer, MitsubaRun) and scene.component == "bounce1" and n in GRADIENT_COUNTS:
+                calls[f"replay {n}"] = lambda tracer=tracer, x=x, normal=normal: tracer.both(x, normal)
+    times = interleaved(calls, max(3, settings.repeats // 2), patience=settings.patience)
+    solve, lights = times["solve"].median, times["lights"].median
+
+    def scaled(n: int, name: str, most: int) -> float:
+        known = times.get(f"{name} {n}")
+        return known.median if known else times[f"{name} {most}"].median * n / most
+
+    lookups = [scaled(n, "lookup", chunk) for n in counts]
+    once = [run.setup["geometry"] + sight * n / chunk for n in counts]
+    ours = {
+        "power changes": [solve + t for t in lookups],
+        "lights move": [solve + lights + t for t in lookups],
+        "all anew": [solve + lights + t + rest for t, rest in zip(lookups, once, strict=True)],
+    }
+    for family, (_, power, most) in tracers.items():
+        peer = peers[family]
+        ratio = peer["paths"] / power
+        peer["seconds"] = [ratio * scaled(n, family, most) for n in counts]
+        peer["break_even"] = {what: crossing(counts, t, peer["seconds"]) for what, t in ours.items()}
+        at = counts.index(1_000_000)
+        peer["speedup_at_million"] = {what: peer["seconds"][at] / t[at] for what, t in ours.items()}
+    gradients: list[dict[str, float]] = []
+    replayed = [n for n in GRADIENT_COUNTS if f"replay {n}" in times]
+    for n in GRADIENT_COUNTS if replayed else ():
+        if f"both {n}" in times:
+            ratio = peers["Mitsuba 3"]["paths"] / peers["Mitsuba 3"]["traced_paths"]
+            known = n if n in replayed else replayed[-1]
+            replay = ratio * times[f"replay {known}"].median * n / known
+            gradients.append({"receivers": n, "ours": times[f"both {n}"].median, "path_replay": replay})
+    return {
+        "scene": scene.key, "configuration": best.name, "error": best.error, "counts": list(counts),
+        "measured": measured[-1], "gradients": gradients, "ours": ours, "peers": peers,
+        "geometry_seconds": run.setup["geometry"], "sight_seconds_per_receiver": sight / chunk,
+    }  # fmt: skip
