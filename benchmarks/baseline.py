@@ -22,7 +22,7 @@ BASELINE = Path(__file__).with_name("baseline.json")
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("out/bench"))
-    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--update", action="store_true", help="write the ratios of this run to baseline.json")
     options = parser.parse_args()
     found = ratios(run_bench(options.out, settings=BenchSettings.of_quick(), threads=options.threads))

@@ -10,7 +10,7 @@ from typing import Any
 
 from difflpv.bench.breakeven import EQUAL_ERROR
 from difflpv.bench.measure import Point
-from difflpv.bench.pareto import front_verdict, pareto_front
+from difflpv.bench.pareto import front_verdict, pareto_front, volume_solves
 from difflpv.bench.published import published_tables
 from difflpv.bench.run import BenchResult
 from difflpv.io.atomic import write_bytes, write_text
@@ -36,8 +36,9 @@ def write_charts(folder: Path, result: BenchResult, *, svg: bool = True) -> dict
     figures: dict[str, Any] = {}
     for key, scene in result.scenes.items():
         own = _of(result, key)
-        front = [p.name for p in pareto_front(own)]
-        figures[key] = draw_error_over_time([_plain(p) for p in own], front, title=key, noise=scene["noise"])
+        front, volumes = ([p.name for p in pareto_front(part)] for part in (own, volume_solves(own)))
+        shown = [_plain(p) for p in own]
+        figures[key] = draw_error_over_time(shown, front, title=key, noise=scene["noise"], volumes=volumes)
     for even in result.break_even:
         figures[f"break-even {even['scene']}"] = draw_break_even(even)
     if result.growth:

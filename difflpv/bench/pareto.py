@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from difflpv.bench.measure import Point
 
-__all__ = ["front_verdict", "pareto_front"]
+__all__ = ["front_verdict", "pareto_front", "volume_solves"]
 
 
 def pareto_front(points: Sequence[Point]) -> list[Point]:
@@ -23,6 +23,11 @@ def pareto_front(points: Sequence[Point]) -> list[Point]:
     return front
 
 
+def volume_solves(points: Sequence[Point]) -> list[Point]:
+    """Those that solve a volume, and the constant that they have to beat."""
+    return [p for p in points if p.family in ("constant", "LPV", "HOLPV", "learned")]
+
+
 def front_verdict(points: Sequence[Point], published: Sequence[str]) -> str:
     """What a scene says, in a sentence: whose volume solves lie on their front, and whether tracing paths beats them all.
 
@@ -30,8 +35,7 @@ def front_verdict(points: Sequence[Point], published: Sequence[str]) -> str:
         points: of one scene and component.
         published: names of configurations as in a publication.
     """
-    volumes = [p for p in points if p.family in ("constant", "LPV", "HOLPV", "learned")]
-    front = pareto_front(volumes)
+    front = pareto_front(volume_solves(points))
     learned = [p for p in front if p.family == "learned"]
     old = [p.name for p in front if p.name in published]
     if not front:

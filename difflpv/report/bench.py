@@ -23,7 +23,7 @@ _DPI = 75
 
 
 def draw_error_over_time(
-    points: Sequence[Mapping[str, Any]], front: Sequence[str], *, title: str, noise: float, legend: bool = True
+    points: Sequence[Mapping[str, Any]], front: Sequence[str], *, title: str, noise: float, volumes: Sequence[str] = ()
 ) -> Figure:
     """Error over the time of a solve with its lookup, both logarithmic.
 
@@ -32,9 +32,9 @@ def draw_error_over_time(
         front: names on the Pareto front, the fastest first.
         title: over the chart.
         noise: of the truth: errors within the band below it mean nothing.
-        legend: name the families.
+        volumes: names on the front of volume solves among themselves, the fastest first.
     """
-    figure = new_figure(6.4, 4.4, dpi=_DPI)
+    figure = new_figure(8.2, 4.4, dpi=_DPI)
     axis = axes_in_row(figure, 1)[0]
     by_name = {p["name"]: p for p in points}
     timed = [p for p in points if p["seconds"]]
@@ -44,9 +44,14 @@ def draw_error_over_time(
         for p in (p for p in points if p["family"] == family):
             label = "constant" if family == "constant" else "true SH in the cells"
             axis.axhline(p["error"], color=FAMILY_COLORS[family], linestyle=dash, linewidth=1.2, label=label)
-    line = [by_name[name] for name in front if name in by_name]
-    axis.plot([1e3 * p["seconds"] for p in line], [p["error"] for p in line], color="#bbbbbb", linewidth=5, zorder=1,
-              solid_capstyle="round", label="Pareto front")  # fmt: skip
+    for names, label, style in (
+        (front, "Pareto front", {"color": "#bbbbbb", "linewidth": 5, "solid_capstyle": "round"}),
+        (volumes, "front of volume solves", {"color": FAMILY_COLORS["learned"], "linewidth": 1}),
+    ):
+        line = [by_name[name] for name in names if name in by_name]
+        if line:
+            x, y = [1e3 * p["seconds"] for p in line], [p["error"] for p in line]
+            axis.plot(x, y, zorder=1, label=label, **style)  # type: ignore[arg-type]
     for family, marker in _MARKERS.items():
         own = [p for p in timed if p["family"] == family]
         if own:
@@ -55,10 +60,10 @@ def draw_error_over_time(
     axis.set(xscale="log", yscale="log", xlabel="time of one solve with its lookup [ms]", ylabel="relative L2 error")
     top = max(p["error"] for p in points)
     axis.set_ylim(0.7 * lowest, 1.3 * top)
-    _plain_ticks(axis.yaxis)
+    for ticks in (axis.xaxis, axis.yaxis):
+        _plain_ticks(ticks)
     title_axis(axis, title)
-    if legend:
-        axis.legend(frameon=False, fontsize=8, ncol=2, loc="best")
+    figure.legend(frameon=False, fontsize=8, loc="outside right upper")
     return figure
 
 
@@ -81,10 +86,17 @@ def draw_break_even(even: Mapping[str, Any]) -> Figure:
 
 def draw_growth(rows: Sequence[Mapping[str, Any]]) -> Figure:
     """Cost over one size at a time, with the fitted exponent."""
+    from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+
     figure = new_figure(2.5 * len(rows), 2.7, dpi=_DPI)
     for axis, row in zip(axes_in_row(figure, len(rows)), rows, strict=True):
         axis.plot(row["sizes"], [1e3 * s for s in row["seconds"]], "o-", color=FAMILY_COLORS["learned"], markersize=4)
         axis.set(xscale="log", yscale="log", xlabel=row["what"], ylabel="ms" if row is rows[0] else "")
+        if row["sizes"][-1] < 1000:
+            axis.xaxis.set_major_locator(FixedLocator(row["sizes"]))
+            axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.xaxis.set_minor_locator(NullLocator())
+        _plain_ticks(axis.yaxis)
         title_axis(axis, f"exponent {row['exponent']:.2f}")
     return figure
 
