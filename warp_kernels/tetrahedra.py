@@ -76,14 +76,10 @@ def tetrahedra_kernels(scalar: Any) -> TetrahedraKernels:
 
     @wp.func
     def lowest(b: vec4):
-        k = wp.int32(0)
-        if b[1] < b[0]:
-            k = 1
-        if b[2] < b[k]:
-            k = 2
-        if b[3] < b[k]:
-            k = 3
-        return k
+        k = wp.where(b[1] < b[0], 1, 0)  # without branches, which no processor could predict here
+        low = wp.min(b[0], b[1])
+        j = wp.where(b[3] < b[2], 3, 2)
+        return wp.where(wp.min(b[2], b[3]) < low, j, k)
 
     @wp.func
     def along(x: vec3, a: vec3, b: vec3):
