@@ -186,7 +186,7 @@ class TetrahedralInterpolation:
         self._valid = None if valid is None else np.array(valid, bool)
         self._corners = np.empty((0, 3)) if box is None else _corners(box)
         self._nearest = np.zeros(0, np.int64)
-        self._last = torch.zeros(0, dtype=torch.int64)
+        self.forget()
         self.triangulations = 0
         self.retriangulate(x)
 
@@ -209,6 +209,10 @@ class TetrahedralInterpolation:
         parts = (self.tetrahedra.vertices, self.tetrahedra.neighbours, self.tetrahedra.hull, self.tetrahedra.first)
         self._tensors = tuple(torch.from_numpy(np.ascontiguousarray(part)) for part in parts)
         self.triangulations += 1
+
+    def forget(self) -> None:
+        """Let the next walks start in the first tetrahedron, not where the same number of points was found last."""
+        self._last = torch.zeros(0, dtype=torch.int64)
 
     def rows(self, position: torch.Tensor, points: torch.Tensor) -> Rows:
         """Weights [m,4] of ``points`` [m,3] m over probes at ``position`` [n,3] m, differentiable in both.
