@@ -5,9 +5,10 @@
 
 Probes and points are uniform in a box, the probes' hull reaching its corners ("inside") or not ("mixed": some points lie
 outside and take the closest point of the hull). "cold": each walk starts in the first tetrahedron; "hinted": near where the
-same point was found last, after a move of 1 % of the box. A full lookup is locating, weighing and the irradiance of one normal from
-9 x RGB. CPU time, because this machine is shared; the best of the repeats, taken in turns. Sight: in a bundled scene, 64 probes
-and 4,000 receivers at random; the share of weight on probes that a ray shows to be blocked, before and after weights by sight.
+same point was found last, after a move of 1 % of the box. A full lookup is locating, weighing and the irradiance of one normal
+from 9 x RGB. CPU time, because this machine is shared; the best of the repeats, taken in turns. Sight: in a bundled scene, 64
+probes and 4,000 receivers at random; the share of weight on probes that a ray shows to be blocked, before and after weights by
+sight.
 """
 
 from __future__ import annotations
