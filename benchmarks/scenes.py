@@ -148,11 +148,11 @@ def table_of(scene: Scene, components: tuple[str, ...], folder: Path) -> list[st
     constant = [cell(predict_constant(t, weight), t, weight, dark) for t in truths.values()]
     lines.append("| constant | " + " | ".join(constant) + " | |")
     for row in ROWS:
-        cells, begin = [], time.perf_counter()
+        cells, begin = [], time.process_time()
         for component in components:
             found = simulate(scene, x, n, grid=grid_for(scene, row.cells), config=row.config, component=component)  # type: ignore[arg-type]
             cells.append(cell(found.irradiance, truths[component], weight, dark))
-        seconds = (time.perf_counter() - begin) / len(components)
+        seconds = (time.process_time() - begin) / len(components)
         lines.append(f"| {row.name} | " + " | ".join(cells) + f" | {seconds:.1f} |")
         print(lines[-1], flush=True)
     for plan in FIT_ROWS:
@@ -278,8 +278,8 @@ def main() -> None:
         "Written by `python benchmarks/scenes.py`; do not edit. Each entry: area-weighted relative L2 error of irradiance,",
         "raw / at the best single scale (that scale); for two_rooms_90 also the leak, the mean error in the far room over the",
         "mean of the lit one. 32 steps, p = 1, unless said otherwise. *Floor*: the true radiance SH of degree 2 in every cell,",
-        "path-traced, read by the same lookup: what a perfect propagation could do (`--method floor`). Seconds: one solve with",
-        "all its rays, one thread, noisy.",
+        "path-traced, read by the same lookup: what a perfect propagation could do (`--method floor`). Seconds: processor",
+        "time of one solve with all its rays, one thread.",
         "",
         "Only the rows *fitted* have seen their scene, and none of them what it is judged on: in cornell and two_rooms_90 they",
         f"were fitted under light sets {min(TRAIN)} to {max(TRAIN)} and are judged, as all rows, under the scene's own light; "

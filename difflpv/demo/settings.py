@@ -45,7 +45,7 @@ class DemoSettings:
     lpv_budget: float = 72.0
     holpv_budget: float = 48.0
     learned_budget: float = 30.0
-    floor_spp: int = 512
+    floor_spp: int = 1024
 
     def __post_init__(self) -> None:
         if not self.train or self.image_light not in self.test or set(self.train) & set(self.test):
