@@ -87,7 +87,9 @@ class OpenCells:
         ``bias`` is the offset of trilinear weights along the normal, in cells; affine ones are read at the point itself.
         """
         if self.cells.shape[1] == len(_BLOCK):
-            return self._affine(cell_coordinates(position, grid))
+            # outside the grid the fit would be read ever farther from all centres, until rounding takes it (NaN from 40 cells)
+            u = cell_coordinates(position, grid)
+            return self._affine(torch.minimum(u.clamp_min(0), u.new_tensor(grid.resolution)))
         u = cell_coordinates(shifted_points(position, normal, grid, bias), grid)
         # beyond the outermost centres the edge cells answer, as in difflpv.sampling
         u = torch.minimum(u.clamp_min(0.5), u.new_tensor(grid.resolution) - 0.5)

@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -128,6 +130,21 @@ def test_affine_weights_stay_finite_far_from_the_grid(far):
     scene = box_scene(low=(-2e4, -5, -5), high=(2e4, 5, 5))
     found = open_cells(position, normal, GRID, mode="affine", raycaster=Raycaster(scene))
     assert bool(torch.isfinite(found.weights(torch.tensor(position).float(), torch.tensor(normal).float(), GRID)).all())
+
+
+def test_affine_weights_outside_are_those_of_the_nearest_point_of_the_grid():
+    """Float32, one cell in sight: read at the point itself 48 cells away the fit was NaN."""
+    grid = Grid((-3.5, -2.5, -8.3), 0.3125, (32, 32, 32))
+    far, normal = np.array([[-18.6, 13.8, 10.1]]), np.array([[1.0, 0, 0]])
+    seen = open_cells(far, normal, grid, mode="affine", raycaster=Raycaster(box_scene()))
+    opened = torch.zeros_like(seen.open)
+    opened[:, 19] = 1.0  # the only one of the block in sight
+    seen = dataclasses.replace(seen, open=opened)
+    x, n = torch.tensor(far, dtype=torch.float32), torch.tensor(normal, dtype=torch.float32)
+    near = torch.tensor(np.clip(far, grid.minimum, grid.maximum), dtype=torch.float32)
+    weights = seen.weights(x, n, grid)
+    assert bool(weights.isfinite().all())
+    torch.testing.assert_close(weights, seen.weights(near, n, grid))
 
 
 def test_edge_cells_answer_beyond_the_outermost_centres_and_outside():

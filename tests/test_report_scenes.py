@@ -11,6 +11,7 @@ from difflpv.report.picture import axis_camera, picture
 from difflpv.report.scene_figures import LobeSlice, lobe_picture, probe_figure, probe_picture
 from difflpv.scene import Camera
 from difflpv.sh import cosine_lobe
+from difflpv.shapes.overview import outside_camera
 from difflpv.shapes.shape import Shape
 from difflpv.shapes.spheres import sphere_normals, sphere_shape
 
@@ -88,3 +89,21 @@ def test_a_slice_points_where_its_light_goes():
     y, x = np.argwhere(changed).T
     assert x.mean() > 100 + 10 and abs(y.mean() - changed.shape[0] / 2) < 3
     assert plain.min() < 0.05, "the walls are outlined"
+
+
+@pytest.mark.parametrize("name", ["two_rooms_90", "planter"])
+def test_an_overview_sees_all_corners_of_a_room_whose_camera_is_inside(name):
+    scene = load_scene(name)
+    camera = outside_camera(scene)
+    low, high = scene.bounds
+    corners = np.array([[(low, high)[k >> a & 1][a] for a in range(3)] for k in range(8)])
+    local = (corners - camera.to_world[:3, 3]) @ camera.to_world[:3, :3]
+    slope = np.tan(camera.yfov / 2)
+    x, y = local[:, 0] / -local[:, 2] / slope * camera.height / camera.width, local[:, 1] / -local[:, 2] / slope
+    assert (local[:, 2] < 0).all() and max(np.abs(x).max(), np.abs(y).max()) == pytest.approx(1 / 1.05, rel=1e-6)
+    np.testing.assert_allclose(camera.to_world[:3, :3] @ camera.to_world[:3, :3].T, np.eye(3), atol=1e-12)
+
+
+def test_a_camera_that_stands_outside_is_kept():
+    scene = load_scene("cornell")
+    assert outside_camera(scene) is scene.cameras[0]

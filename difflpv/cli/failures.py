@@ -21,6 +21,7 @@ _LAZY = {
     "difflpv.io.exports.convention": ("ExportError", _BAD_INPUT),
     "difflpv.probes.probe_files": ("ProbeFileError", _BAD_INPUT),
     "difflpv.stencil_files": ("StencilError", _BAD_INPUT),
+    "difflpv.viewer.page": ("MissingViserError", _BAD_INPUT),
     "difflpv.training.stencils": ("TrainingError", _BAD_INPUT),
     "difflpv.optim.checkpoint": ("CheckpointError", _BAD_INPUT),
 }

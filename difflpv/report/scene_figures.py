@@ -10,7 +10,6 @@ import numpy as np
 
 from difflpv.grid import Grid
 from difflpv.io.atomic import write_bytes
-from difflpv.io.default_camera import default_camera
 from difflpv.io.png import auto_exposure
 from difflpv.io.srgb import linear_to_srgb
 from difflpv.probes.probe_set import ProbeSet
@@ -20,6 +19,7 @@ from difflpv.report.style import DPI, new_figure, png_bytes, title_axis
 from difflpv.scene import Camera, Scene
 from difflpv.shapes.colors import exposed
 from difflpv.shapes.lobes import lobe_shape
+from difflpv.shapes.overview import outside_camera
 from difflpv.shapes.section import section
 from difflpv.shapes.shape import Shape, joined
 from difflpv.shapes.spheres import probe_radius, sphere_normals, sphere_shape, tube_shape
@@ -27,7 +27,7 @@ from difflpv.shapes.surfaces import surfaces_of
 
 __all__ = ["LobeSlice", "draw_pictures", "lobe_picture", "probe_figure", "probe_picture"]
 
-_WIDTH = 4.4  # of a picture [inches]
+_WIDTH = 3.7  # of a picture [inches]
 _WALL, _EDGE = (0.03, 0.03, 0.03), (0.05, 0.22, 0.45)
 _INVALID = 0.02
 _LARGEST_PROBE = 0.03  # of the scene's extent
@@ -65,7 +65,7 @@ def probe_figure(
         edges: segments [m,2,3] m between them, of their tetrahedra say.
         title: a line over the picture.
         surfaces: coloured triangles in place of the scene's albedo.
-        camera: the scene's first by default, or one that looks at the middle of its bounds.
+        camera: by default one that stands outside (``difflpv.shapes.overview``).
         stops: exposure of the spheres; by default white is their 98th percentile.
     """
     image = probe_picture(scene, probes, edges=edges, surfaces=surfaces, camera=camera, stops=stops)
@@ -82,7 +82,7 @@ def probe_picture(
     camera: Camera | None = None,
     stops: float | None = None,
     irradiance: np.ndarray | None = None,
-    width: int = 640,
+    width: int = 560,
 ) -> np.ndarray:
     """The picture of ``probe_figure``, linear [H,W,3].
 
@@ -102,11 +102,10 @@ def probe_picture(
         parts.append(sphere_shape(probes.position, probe_radius(probes.position, _LARGEST_PROBE * extent), color))
     if edges is not None:
         parts.append(tube_shape(edges, 0.0012 * extent, _EDGE))
-    view = camera or (scene.cameras[0] if scene.cameras else default_camera(scene))
-    return picture(joined(parts), view, width=width, background=(0.012, 0.012, 0.012))
+    return picture(joined(parts), camera or outside_camera(scene), width=width, background=(0.012, 0.012, 0.012))
 
 
-def lobe_picture(scene: Scene, layer: LobeSlice, *, reference: float | None = None, width: int = 640) -> np.ndarray:
+def lobe_picture(scene: Scene, layer: LobeSlice, *, reference: float | None = None, width: int = 560) -> np.ndarray:
     """A slice of SH lobes as on a plan, with the outline of the walls in its plane, linear [H,W,3].
 
     ``reference`` is the largest value that stands for the longest lobe (``difflpv.shapes.lobes.lobe_shape``).
