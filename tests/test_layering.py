@@ -75,6 +75,7 @@ LAYERS: tuple[tuple[str, tuple[str, ...]], ...] = (
         (
             "difflpv.blocking",
             "difflpv.config",
+            "difflpv.config_file",
             "difflpv.fitted",
             "difflpv.illumination",
             "difflpv.learnables",
@@ -96,7 +97,7 @@ LAYERS: tuple[tuple[str, tuple[str, ...]], ...] = (
         ),
     ),
     ("report", ("difflpv.report",)),
-    ("demo", ("difflpv.bench", "difflpv.demo", "difflpv.stress", "difflpv.viewer")),
+    ("demo", ("difflpv.bench", "difflpv.demo", "difflpv.planning", "difflpv.stress", "difflpv.viewer")),
     ("cli", ("difflpv.cli",)),
     ("scripts", ("scripts",)),
 )
@@ -148,7 +149,10 @@ ONLY = (
 )
 
 # Only these parts may know the path tracer: what they judge must not.
-DATA_GEN_USERS = ("data_gen", "difflpv.bench", "difflpv.cli", "difflpv.demo", "difflpv.stress", "difflpv.training", "scripts")
+DATA_GEN_USERS = (
+    "data_gen", "difflpv.bench", "difflpv.cli", "difflpv.demo", "difflpv.planning", "difflpv.stress",
+    "difflpv.training", "scripts",
+)  # fmt: skip
 
 LIBRARY_OWNERS: dict[str, tuple[str, ...]] = {
     "warp": ("warp_kernels", "difflpv.bridge", "difflpv.face_propagation"),

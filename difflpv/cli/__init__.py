@@ -20,7 +20,8 @@ from difflpv.cli.options import UsageError
 __all__ = ["COMMANDS", "main"]
 
 COMMANDS = (
-    "targets", "simulate", "fit", "evaluate", "render", "view", "info", "demo", "train_stencil", "stress", "bench", "probes",
+    "targets", "plan", "simulate", "fit", "evaluate", "render", "view", "info", "demo", "train_stencil", "stress", "bench",
+    "probes",
 )  # fmt: skip
 _INTERRUPTED = 130
 _CLOSED_PIPE = 141  # what a shell reports for a program that SIGPIPE ended

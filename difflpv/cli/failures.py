@@ -17,6 +17,7 @@ _LAZY = {
     "data_gen.load": ("TargetsError", _BAD_INPUT),
     "data_gen.blocks": ("WorkerError", _FAILED),
     "difflpv.io.exr": ("ImageError", _BAD_INPUT),
+    "difflpv.config_file": ("ConfigFileError", _BAD_INPUT),
     "difflpv.fitted": ("FittedError", _BAD_INPUT),
     "difflpv.io.exports.convention": ("ExportError", _BAD_INPUT),
     "difflpv.probes.probe_files": ("ProbeFileError", _BAD_INPUT),

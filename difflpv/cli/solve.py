@@ -84,6 +84,9 @@ def add_solve(parser: Any, *, methods: tuple[str, ...] = METHODS, fitted: bool =
         metavar="N",
         help="after N steps light goes on in cells of twice the edge, at an eighth of the cost (default: one grid)",
     )
+    group.add_argument(
+        "--config", type=Path, metavar="FILE.json", help="what 'difflpv plan' wrote, in place of the options above but --grid"
+    )
     if fitted:
         group.add_argument(
             "--fitted", type=Path, metavar="DIR", help="a model from 'difflpv fit', in place of the options above"
@@ -135,7 +138,11 @@ def solve_from(args: argparse.Namespace, scene: Scene, **defaults: Any) -> Solve
     given = {name: getattr(args, name) for name in _FIELDS if getattr(args, name) is not None}
     folder = getattr(args, "fitted", None)
     if folder is not None:
+        if args.config is not None:
+            raise UsageError("--config: --fitted brings a configuration of its own, give one of the two")
         return _fitted(args, scene, folder, given)
+    if args.config is not None:
+        return _configured(args, scene, given)
     method = given.get("method", "holpv")
     if method == "floor":
         for name in sorted(given.keys() - {"method", "lookup"}):
@@ -148,6 +155,22 @@ def solve_from(args: argparse.Namespace, scene: Scene, **defaults: Any) -> Solve
         volume |= {} if method in ("constant", "floor") else {"method": method}
         config = LpvConfig(**(defaults | volume))
     return Solve(method, config, grid)
+
+
+def _configured(args: argparse.Namespace, scene: Scene, given: dict[str, Any]) -> Solve:
+    from difflpv.config import LpvConfig, grid_for
+    from difflpv.config_file import read_config_file
+
+    file = read_config_file(args.config)
+    fixed = {"method": file.method} if file.config is None else file.config.to_json()
+    for name, value in given.items():
+        if value != fixed.get(name):
+            shown = "" if isinstance(value, bool) else f" {value}"
+            raise UsageError(f"{_option(name, value)}{shown}: {args.config} has {name} {fixed.get(name)}")
+    if file.config is None and not hasattr(args, "fitted"):
+        raise UsageError(f"--config: {args.config} is a constant, which has nothing to fit")
+    with usage_errors():
+        return Solve(file.method, file.config or LpvConfig(), grid_for(scene, args.grid or file.cells))
 
 
 def _fitted(args: argparse.Namespace, scene: Scene, folder: Path, given: dict[str, Any]) -> Solve:

@@ -1,0 +1,1 @@
+"""The cheapest model that a scene needs for an error, or the most accurate one for a time, and why."""

@@ -1,0 +1,180 @@
+"""Plan a scene: judge the ladder, choose, and keep what was learned on the way."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from difflpv.bench.configuration import Configuration
+from difflpv.config import LpvConfig
+from difflpv.illumination import Component
+from difflpv.io.atomic import write_json
+from difflpv.planning.judging import LEVELS, Level, SceneJudge
+from difflpv.planning.ladder import PLAN_LADDER
+from difflpv.planning.lights import held_out_lights
+from difflpv.planning.race import Judge, Runner, cheapest, most_accurate
+from difflpv.scene import Scene
+
+__all__ = ["Plan", "make_plan", "plan_with"]
+
+_FORMAT = 1
+
+
+@dataclass(eq=False)
+class Plan:
+    """What to solve a scene with, and why.
+
+    Attributes:
+        chosen: the rung that meets the goal, or None.
+        runners: the whole ladder, with what is known of each rung.
+        tolerance: of the relative error, or None.
+        budget: seconds of a solve, or None.
+        confidence: of every bound, one-sided.
+        last_level: the level on which a choice was made.
+        interrupted: True where the race was broken off.
+        seconds: spent on planning, by "truth" and "rungs".
+        about: scene, component, lights and levels, for the file.
+    """
+
+    chosen: Runner | None
+    runners: list[Runner]
+    tolerance: float | None
+    budget: float | None
+    confidence: float
+    last_level: int
+    interrupted: bool = False
+    seconds: dict[str, float] = field(default_factory=dict)
+    about: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def best(self) -> Runner | None:
+        """What is chosen, or else the most accurate rung judged (within the budget), of those judged most closely."""
+        if self.chosen is not None:
+            return self.chosen
+        judged = [r for r in self.runners if r.estimate is not None and r.state != "dear"]
+        if not judged:
+            return None
+        closest = max(r.level for r in judged)
+        return min((r for r in judged if r.level == closest), key=_error)
+
+    @property
+    def config(self) -> LpvConfig | None:
+        """Of the best rung; None for the constant, or where nothing was judged."""
+        return None if self.best is None else self.best.rung.config
+
+    @property
+    def front(self) -> list[Runner]:
+        """Judged rungs that are more accurate than all cheaper ones, cheapest first, up to the best one."""
+        found: list[Runner] = []
+        judged = [r for r in self.runners if r.estimate is not None and r.seconds is not None]
+        for runner in sorted(judged, key=lambda r: (r.seconds, r.work)):
+            if not found or _error(runner) < _error(found[-1]):
+                found.append(runner)
+            if runner is self.best:
+                break
+        return found
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values; ``difflpv.config_file`` reads them."""
+        best = self.best
+        return {
+            "format": _FORMAT,
+            "method": None if best is None else best.rung.config.method if best.rung.config else "constant",
+            "cells": None if best is None else best.rung.cells,
+            "config": None if best is None or best.rung.config is None else best.rung.config.to_json(),
+            "met": self.chosen is not None,
+            "interrupted": self.interrupted,
+            "tolerance": self.tolerance,
+            "budget_seconds": self.budget,
+            "confidence": self.confidence,
+            "planning_seconds": self.seconds,
+            **self.about,
+            "rungs": [_runner_json(r) for r in self.runners],
+        }
+
+    def save(self, path: str | Path) -> None:
+        """Write the file for ``--config``."""
+        write_json(path, self.to_json())
+
+
+def _error(runner: Runner) -> float:
+    assert runner.estimate is not None
+    return runner.estimate.error
+
+
+def _runner_json(runner: Runner) -> dict[str, Any]:
+    known = {} if runner.estimate is None else runner.estimate.to_json()
+    return {"name": runner.rung.name, "state": runner.state, "level": runner.level, "seconds": runner.seconds, **known}
+
+
+def plan_with(
+    judge: Judge,
+    rungs: Sequence[Configuration],
+    *,
+    tolerance: float | None = None,
+    budget: float | None = None,
+    confidence: float = 0.95,
+    tell: Callable[[Runner], object] = lambda runner: None,
+) -> Plan:
+    """Plan with any judge; an interruption (Ctrl-C) keeps what is known. Arguments as for ``make_plan``."""
+    if (tolerance is None) == (budget is None):
+        raise ValueError("plan: expected a tolerance or a budget, one of the two")
+    runners: list[Runner] = []
+    chosen, interrupted = None, False
+    try:
+        if tolerance is not None:
+            chosen = cheapest(rungs, judge, tolerance, runners=runners, tell=tell)
+        elif budget is not None:
+            chosen = most_accurate(rungs, judge, budget, runners=runners, tell=tell)
+    except KeyboardInterrupt:
+        interrupted = True
+    return Plan(chosen, runners, tolerance, budget, confidence, len(judge.slack) - 1, interrupted)
+
+
+def make_plan(
+    scene: Scene,
+    folder: str | Path,
+    *,
+    tolerance: float | None = None,
+    budget: float | None = None,
+    component: Component = "bounce1",
+    rungs: Sequence[Configuration] = PLAN_LADDER,
+    levels: Sequence[Level] = LEVELS,
+    confidence: float = 0.95,
+    seed: int = 0,
+    workers: int = 1,
+    tell: Callable[[Runner], object] = lambda runner: None,
+) -> Plan:
+    """The cheapest model of a scene within a tolerance, or the most accurate one within a budget.
+
+    Args:
+        scene: under its own lights.
+        folder: for the path-traced truth.
+        tolerance: of the relative L2 error over receivers and lights, surely met with ``confidence``.
+        budget: seconds that one solve may take on this machine.
+        component: "direct" or "bounce1".
+        rungs: the ladder.
+        levels: how closely rungs are judged, coarsest first.
+        confidence: of every bound, one-sided.
+        seed: of receivers, paths and moved lights.
+        workers: processes of the path tracer.
+        tell: told every runner that was judged.
+
+    Raises:
+        ValueError: neither or both of tolerance and budget, one that is not positive, or a component that is dark.
+    """
+    begin = time.perf_counter()
+    lights = held_out_lights(scene, max(level.lights for level in levels), seed=seed)
+    judge = SceneJudge(
+        scene, component, lights, folder, levels=levels, confidence=confidence, seed=seed, workers=workers
+    )  # fmt: skip
+    plan = plan_with(judge, rungs, tolerance=tolerance, budget=budget, confidence=confidence, tell=tell)
+    plan.seconds = {**judge.spent, "all": time.perf_counter() - begin}
+    plan.about = {
+        "scene": scene.name, "scene_hash": scene.hash, "component": component, "light_sets": len(lights), "seed": seed,
+        "levels": [{"receivers": level.receivers, "paths": level.spp, "lights": level.lights} for level in levels],
+    }  # fmt: skip
+    return plan
