@@ -65,6 +65,7 @@ class Page:
         self._solved: Solved | None = None
         self._drawn: dict[str, tuple[tuple[Any, ...] | None, Any]] = {}
         self._count = 0
+        self._seconds = 0.0
         self._worker: LatestWorker[tuple[Knobs, Look]] = LatestWorker(self._work, self._failed)
         self._set_up(look or Look(step=state.steps, index=state.lpv.grid.resolution[2] // 2))
         self._ask()
@@ -205,7 +206,9 @@ class Page:
         """Solve if the sliders of the solve moved, and send the layers that changed."""
         knobs, look = request
         if self._solved is None or self._solved.knobs != knobs:
+            started = time.perf_counter()
             self._solved = self.state.solve(knobs)
+            self._seconds = time.perf_counter() - started
         stale = []
         with self._server.atomic():
             for name, key, make in layers(self.state, self._solved, look, self.probes):
@@ -233,7 +236,7 @@ class Page:
         grid = solved.grid_of(look.step)
         place = grid.minimum[AXES.index(look.axis)] + solved.grids[0].cell_size * (look.index + 0.5)
         lines = [f"slice at {look.axis} = {place:.3g} m, cells of {grid.cell_size:.3g} m"]
-        lines.append(f"mean irradiance {solved.surface.mean():.4g} W/m²")
+        lines.append(f"mean irradiance {solved.surface.mean():.4g} W/m², solved in {self._seconds:.2f} s")
         if self.state.truth is not None:
             known = "unknown: targets are of the light as it was" if solved.relative_l2 is None else f"{solved.relative_l2:.3f}"
             lines.append(f"relative L2 error {known}")
