@@ -70,6 +70,8 @@ def left_out(plan: Plan) -> str:
     """One line per reason, naming the rungs."""
     lines = []
     for state, reason in _STATES.items():
+        if state == "out" and plan.budget is not None:
+            reason = "less accurate"
         if state == "open" and (plan.interrupted or plan.chosen is None):
             reason = "not judged to the end"
         names = [f"{r.rung.name} ({_error(r)})" if r.estimate else r.rung.name for r in plan.runners if r.state == state]

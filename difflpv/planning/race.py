@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol
 
 from difflpv.bench.configuration import Configuration
@@ -23,6 +23,8 @@ __all__ = ["Judge", "Runner", "cheapest", "most_accurate"]
 
 _TIE = 1.1  # costs closer than this are told apart by their work
 _FIRST_RATE = 1e-11  # s per product, before anything is measured
+_ABOVE_BASE = 3.0  # times the cheapest solve: what takes so long tells the rate of the work
+_ROUGH = 1.25  # times the budget: a time of two or three runs may be so far off
 _PREDICTION = 1.5  # a rung predicted to be so many times over the budget is not measured
 
 
@@ -72,10 +74,15 @@ class _Field:
     runners: list[Runner]
     judge: Judge
     tell: Callable[[Runner], object]
-    rate: float = field(default=_FIRST_RATE)
 
     def cost(self, runner: Runner) -> float:
-        return runner.work * self.rate if runner.seconds is None else runner.seconds
+        """Measured, or else what the cheapest measured solve costs besides its work, and the work at the best rate seen."""
+        if runner.seconds is not None or not runner.work:
+            return runner.seconds or 0.0
+        known = [(r.seconds, r.work) for r in self.runners if r.seconds is not None and r.work]
+        base = min((seconds for seconds, _ in known), default=0.0)
+        rates = [(seconds - base) / work for seconds, work in known if seconds > _ABOVE_BASE * base]
+        return base + runner.work * min(rates, default=_FIRST_RATE)
 
     def key(self, runner: Runner) -> tuple[int, float]:
         """Order of the climb: costs within a tie are one."""
@@ -85,9 +92,6 @@ class _Field:
         runner.estimate, seconds = self.judge.judge(runner.rung, level)
         runner.seconds = seconds if runner.seconds is None else min(seconds, runner.seconds)
         runner.level = level
-        if runner.work:
-            known = [r.seconds / r.work for r in self.runners if r.seconds is not None and r.work]
-            self.rate = min(known)
         self.tell(runner)
         return runner.estimate
 
@@ -177,7 +181,7 @@ def most_accurate(
                 runner.state = "dear"
                 continue
             race.advance(runner, level)
-            if race.cost(runner) > budget:
+            if race.cost(runner) > budget * (1 if level == len(judge.slack) - 1 else _ROUGH):
                 runner.state = "dear"
         left = sorted((r for r in race.runners if r.state == "open"), key=lambda r: _error(r).error)
         if not left:
