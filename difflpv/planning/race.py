@@ -187,9 +187,11 @@ def most_accurate(
         if not left:
             return None
         if level < len(judge.slack) - 1:
-            bar = min(_error(r).high for r in left)
-            for place, runner in enumerate(left):
-                if _error(runner).low > bar * judge.slack[level] or place >= max(2, math.ceil(len(left) / 2)):
+            inside = [r for r in left if race.cost(r) <= budget]  # others may turn out to be, but push nobody out
+            bar = min((_error(r).high for r in inside), default=math.inf)
+            kept = inside[: max(2, math.ceil(len(inside) / 2))]
+            for runner in left:
+                if _error(runner).low > bar * judge.slack[level] or (runner in inside and runner not in kept):
                     runner.state = "out"
     left[0].state = "chosen"
     for runner in left[1:]:
