@@ -24,7 +24,7 @@ from difflpv.grid import Grid
 from difflpv.io.tables import TableError, load_table, save_table
 from difflpv.scene import AreaLight, Scene
 
-__all__ = ["TrueVolume", "find_volume", "kept_volume", "kept_volumes", "trace_volume", "true_volume"]
+__all__ = ["TrueVolume", "find_volume", "kept_volume", "kept_volumes", "trace_volume"]
 
 _STREAM = 104
 _PATHS = 2**17
@@ -51,11 +51,6 @@ class TrueVolume:
     def mean(self) -> np.ndarray:
         """Intensity [W/sr], shape [3, 9, n_z, n_y, n_x]."""
         return self.halves.mean(0)
-
-
-def true_volume(scene: Scene, grid: Grid, component: str, *, spp: int = 1024, seed: int = 0) -> np.ndarray:
-    """``trace_volume(...).mean``: intensity [W/sr], shape [3, 9, n_z, n_y, n_x] float64."""
-    return trace_volume(scene, grid, component, spp=spp, seed=seed).mean
 
 
 def trace_volume(scene: Scene, grid: Grid, component: str, *, spp: int = 1024, seed: int = 0) -> TrueVolume:

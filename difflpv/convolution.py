@@ -17,11 +17,14 @@ import torch
 
 from difflpv.bridge import refuse_second_derivative
 
-__all__ = ["propagate_convolution"]
+__all__ = ["propagate_convolution", "stencil_weight"]
 
 
-def _kernel(offsets: torch.Tensor, matrices: torch.Tensor) -> torch.Tensor:
-    """conv3d weight [K,K,3,3,3] of a stencil: conv3d reads source d + (tap - 1), so offset n sits at tap 1 - n."""
+def stencil_weight(offsets: torch.Tensor | np.ndarray, matrices: torch.Tensor) -> torch.Tensor:
+    """``conv3d``'s weight [K,K,3,3,3], channels last, of matrices [n,K,K] at offsets [n,3] (x, y, z).
+
+    conv3d reads source d + (tap - 1), so offset n sits at tap 1 - n.
+    """
     weight = matrices.new_zeros((matrices.shape[1], matrices.shape[2], 3, 3, 3))
     for n, matrix in zip(offsets.tolist(), matrices, strict=True):
         weight[:, :, 1 - n[2], 1 - n[1], 1 - n[0]] = matrix
@@ -51,7 +54,7 @@ def _propagate(
     volume: torch.Tensor, offsets: torch.Tensor, matrices: torch.Tensor, factors: torch.Tensor, tolerance: float, keep: bool,
     rest: bool,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
-    weight = _kernel(offsets, matrices.detach())
+    weight = stencil_weight(offsets, matrices.detach())
     moving = volume.detach().clone(memory_format=torch.channels_last_3d)
     total = moving.clone(memory_format=torch.channels_last_3d)
     states = volume.new_empty(_state_shape(volume, len(factors) if keep else 0))
@@ -89,7 +92,7 @@ def _propagate_backward(
     total_bar: torch.Tensor, moving_bar: torch.Tensor, states: torch.Tensor, done: torch.Tensor, offsets: torch.Tensor,
     matrices: torch.Tensor, factors: torch.Tensor, need_matrices: bool, need_factors: bool,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
-    transposed = _kernel(-offsets, matrices.detach().transpose(1, 2))
+    transposed = stencil_weight(-offsets, matrices.detach().transpose(1, 2))
     source = total_bar.detach().contiguous(memory_format=torch.channels_last_3d)
     after = source + moving_bar if moving_bar.numel() else source
     matrices_bar, factors_bar = torch.zeros_like(matrices), torch.zeros_like(factors)

@@ -134,7 +134,7 @@ class Illumination:
         with torch.no_grad():
             return self._shade(LightValues())
 
-    def vpl_cells(self, vpls: Vpls, bias: float) -> OpenCells:
+    def vpl_cells(self, vpls: Vpls, bias: float = _BIAS) -> OpenCells:
         """Cells that each VPL may give to, for deposit="visible": traced once for the scene's own lights, anew for moved ones.
 
         Args:

@@ -16,9 +16,10 @@ from difflpv.grid import Grid
 from difflpv.scene import AreaLight, DirectionalLight, Material, Mesh, Scene
 from difflpv.simulate import simulate
 
-__all__ = ["blocked_share", "leak", "self_lighting"]
+__all__ = ["blocked_share", "dark_receivers", "leak", "self_lighting"]
 
 _CELLS = 16
+_DARK = {"two_rooms_90": (0, 0.06)}  # axis and bound [m] beyond which the far room lies
 _SHIFTS = (np.arange(8) + 0.5) / 8 - 0.5
 
 
@@ -40,6 +41,14 @@ def leak(prediction: np.ndarray, target: np.ndarray, dark: np.ndarray, weight: n
     if not (weight * dark).any() or not lit > 0:
         raise ValueError("dark: expected receivers in the dark and in the light, and light there")
     return float(np.average(np.abs(prediction - target)[dark].mean(1), weights=weight[dark]) / lit)
+
+
+def dark_receivers(scene_name: str, position: np.ndarray) -> np.ndarray | None:
+    """Which receivers [n,3] m of a bundled scene lie in its dark region, bool [n]; None where it has none."""
+    if scene_name not in _DARK:
+        return None
+    axis, bound = _DARK[scene_name]
+    return np.asarray(position[:, axis] > bound)
 
 
 def self_lighting(config: LpvConfig) -> float:

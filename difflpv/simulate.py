@@ -61,9 +61,7 @@ def read_volume(volume: np.ndarray, light: Illumination, position: np.ndarray, n
     for begin in range(0, max(len(position), 1), _RECEIVERS_PER_CHUNK):
         rows = slice(begin, begin + _RECEIVERS_PER_CHUNK)
         receivers = light.receivers(position[rows], normal[rows])
-        irradiance = lpv.read((torch.as_tensor(volume).to(receivers.position),), receivers)
-        exact = light.punctual_irradiance(receivers)
-        parts.append((irradiance if exact is None else irradiance + exact).cpu().numpy())
+        parts.append(lpv.gather((torch.as_tensor(volume).to(receivers.position),), light, receivers).cpu().numpy())
     return np.concatenate(parts).astype(np.float64)
 
 

@@ -7,7 +7,7 @@ import pytest
 from cli_room import difflpv, make_targets, write_room
 from PIL import Image
 
-from data_gen.cells import true_volume
+from data_gen.cells import trace_volume
 from data_gen.load import load_targets
 from difflpv.config import LpvConfig, grid_for
 from difflpv.illumination import illuminate
@@ -142,7 +142,7 @@ def test_the_floor_reads_the_true_light_and_keeps_it(room, table, tmp_path, caps
     content, err = run_json(capsys, *command, "--spp", 2048)
     scene, asked = load_scene(room / "room.glb"), load_receivers(table)
     lit = apply_light_set(scene, load_light_sets(room / "sets.json", "room")[1])
-    volume = true_volume(lit, grid_for(scene), "direct", spp=2048)
+    volume = trace_volume(lit, grid_for(scene), "direct", spp=2048).mean
     light = illuminate(lit, grid_for(scene), LpvConfig(lookup="affine"), "direct")
     expected = read_volume(volume, light, asked.position, asked.normal)
     np.testing.assert_allclose(load_table(tmp_path / "f.npz")["irradiance"], expected, rtol=1e-4, atol=1e-4)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from hand_scenes import box_scene, panel_scene
 
-from data_gen.cells import find_volume, kept_volume, kept_volumes, trace_volume, true_volume
+from data_gen.cells import find_volume, kept_volume, kept_volumes, trace_volume
 from difflpv.grid import Grid
 
 GRID = Grid((-0.6, 0.2, -0.6), 0.4, (3, 2, 3))
@@ -37,11 +37,11 @@ def test_fluence_of_a_panel_against_its_solid_angle():
 
 
 def test_punctual_lights_are_left_to_the_exact_part_and_seeds_repeat():
-    assert not true_volume(box_scene(), GRID, "direct").any()
-    first, again = (true_volume(box_scene(), GRID, "bounce1", spp=32, seed=3) for _ in range(2))
+    assert not trace_volume(box_scene(), GRID, "direct").mean.any()
+    first, again = (trace_volume(box_scene(), GRID, "bounce1", spp=32, seed=3).mean for _ in range(2))
     assert np.array_equal(first, again) and first[:, 0].min() > 0
     with pytest.raises(ValueError, match="component 'bounce'"):
-        true_volume(box_scene(), GRID, "bounce")
+        trace_volume(box_scene(), GRID, "bounce")
 
 
 def test_a_volume_is_traced_once_and_known_by_scene_lights_grid_and_component(tmp_path, monkeypatch):

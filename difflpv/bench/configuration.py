@@ -6,7 +6,7 @@ A ``kind`` says how it is solved (``difflpv.bench.measure.prepare``), a ``family
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 from difflpv.config import LpvConfig
@@ -132,4 +132,4 @@ def chosen(names: Sequence[str] | None = None, *, quick: bool = False) -> tuple[
     for name in names:
         if name not in by_name:
             raise ValueError(f"configuration: no '{name}', expected names of {', '.join(by_name)}")
-    return tuple(replace(by_name[name]) for name in names)
+    return tuple(by_name[name] for name in names)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import torch
 
+from difflpv.convolution import stencil_weight
 from difflpv.reference.propagation import propagate_linear
 from difflpv.stencil import LinearStencil
 
@@ -16,12 +17,8 @@ Steps = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 
 
 def convolution_weight(stencil: LinearStencil) -> torch.Tensor:
-    """``conv3d``'s weight [K,K,3,3,3] of a linear stencil."""
-    coeffs = (stencil.l_max + 1) ** 2
-    weight = torch.zeros(coeffs, coeffs, 3, 3, 3)
-    for n, matrix in zip(stencil.offsets.tolist(), stencil.matrices, strict=True):
-        weight[:, :, 1 - n[2], 1 - n[1], 1 - n[0]] = torch.tensor(matrix, dtype=torch.float32)
-    return weight
+    """``conv3d``'s weight [K,K,3,3,3] of a linear stencil, contiguous."""
+    return stencil_weight(stencil.offsets, torch.tensor(stencil.matrices, dtype=torch.float32)).contiguous()
 
 
 def convolution(volume: torch.Tensor, weight: torch.Tensor, factors: torch.Tensor) -> torch.Tensor:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from data_gen.load import Targets
 from data_gen.receivers import draw_receivers
 from data_gen.targets import make_targets
 from difflpv.config import grid_for
@@ -16,10 +17,11 @@ from difflpv.evaluate import relative_noise
 from difflpv.grid import Grid
 from difflpv.illumination import Component
 from difflpv.io import load_scene
+from difflpv.leakage import dark_receivers
 from difflpv.lights import apply_light_set
 from difflpv.scene import AreaLight, Scene
 
-__all__ = ["BUNDLED", "BenchScene", "bench_scenes", "components_of"]
+__all__ = ["BUNDLED", "BenchScene", "bench_scenes", "components_of", "targets_in_grid"]
 
 # Bundled scene -> components that a volume carries there: diagonal is one floor, from which nothing bounces to a receiver;
 # the halls are lit by the sun, whose direct light is exact in every method.
@@ -32,7 +34,6 @@ BUNDLED: dict[str, tuple[Component, ...]] = {
     "floor": ("bounce1",),
     "planter": ("bounce1",),
 }
-_DARK = {"two_rooms_90": (0, 0.06)}  # axis and bound [m] beyond which the far room lies: there a leak can be told
 _MOST_NOISE = 0.5  # of the truth: what is left then is no signal
 
 
@@ -91,6 +92,35 @@ def components_of(scene: Scene) -> tuple[Component, ...]:
     return ("bounce1", "direct") if has_area else ("bounce1",)
 
 
+def targets_in_grid(
+    scene: Scene,
+    folder: str | Path,
+    *,
+    components: Sequence[Component],
+    receivers: int,
+    spp: int,
+    light_sets: Sequence[Sequence[Mapping[str, Any]]] | None = None,
+    seed: int = 0,
+    workers: int = 1,
+) -> Targets:
+    """Path-traced irradiance of receivers drawn by area inside the scene's grid, from ``folder`` if it lies there.
+
+    Args:
+        scene: with a grid of its own or the default one.
+        folder: made if missing; targets of another request in it are replaced.
+        components: as for ``data_gen.targets.make_targets``.
+        receivers: how many.
+        spp: paths per receiver.
+        light_sets: for ``difflpv.lights.apply_light_set``; None for the scene's own lights.
+        seed: of receivers and paths.
+        workers: processes of the path tracer.
+    """
+    return make_targets(
+        scene, folder, receivers=draw_receivers(scene, receivers, seed, within=grid_for(scene)), components=components,
+        spp=spp, light_sets=light_sets, seed=seed, workers=workers, overwrite=True, progress=False,
+    )  # fmt: skip
+
+
 def bench_scenes(
     source: str | Path | Scene,
     folder: str | Path,
@@ -119,24 +149,11 @@ def bench_scenes(
     scene = source if isinstance(source, Scene) else load_scene(source)
     wanted = tuple(components or BUNDLED.get(scene.name, ()) or components_of(scene))
     out = Path(folder)
-    out.mkdir(parents=True, exist_ok=True)
-    targets = make_targets(
-        scene,
-        out,
-        receivers=draw_receivers(scene, receivers, seed, within=grid_for(scene)),
-        components=wanted,
-        spp=spp,
-        light_sets=light_sets,
-        seed=seed,
-        workers=workers,
-        overwrite=True,
-        progress=False,
+    targets = targets_in_grid(
+        scene, out, components=wanted, receivers=receivers, spp=spp, light_sets=light_sets, seed=seed, workers=workers
     )
     position, normal = targets.receivers.position.astype(float), targets.receivers.normal.astype(float)
-    dark = None
-    if scene.name in _DARK:
-        axis, bound = _DARK[scene.name]
-        dark = position[:, axis] > bound
+    dark = dark_receivers(scene.name, position)
     found = []
     for light in targets.lights:
         lit = scene if light_sets is None else apply_light_set(scene, light_sets[light.index])

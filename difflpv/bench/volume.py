@@ -64,7 +64,7 @@ class VolumeRun:
         blocking = known.blocking if known else None
         light = illuminate(self.bench.scene, self.grid, self.config, self.bench.component, blocking=blocking, **self._rays)
         if self.config.deposit == "visible":
-            light.vpl_cells(light.vpls(), 0.5)  # kept by the illumination
+            light.vpl_cells(light.vpls())  # kept by the illumination
         return light
 
     def relight(self) -> Illumination:

@@ -14,7 +14,7 @@ from importlib import import_module
 from typing import NoReturn
 
 import difflpv
-from difflpv.cli.failures import describe_failure
+from difflpv.cli.failures import INTERRUPTED, describe_failure
 from difflpv.cli.options import UsageError
 
 __all__ = ["COMMANDS", "main"]
@@ -23,7 +23,6 @@ COMMANDS = (
     "targets", "plan", "simulate", "fit", "evaluate", "render", "view", "info", "demo", "train_stencil", "stress", "bench",
     "probes",
 )  # fmt: skip
-_INTERRUPTED = 130
 _CLOSED_PIPE = 141  # what a shell reports for a program that SIGPIPE ended
 
 
@@ -66,7 +65,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _CLOSED_PIPE
     except KeyboardInterrupt:
         print("difflpv: interrupted", file=sys.stderr)
-        return _INTERRUPTED
+        return INTERRUPTED
     except SystemExit as end:  # --help and --version
         return int(end.code or 0)
     except Exception as error:

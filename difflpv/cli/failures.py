@@ -9,13 +9,13 @@ from difflpv.cli.options import UsageError
 from difflpv.io.tables import TableError
 from difflpv.scene import SceneError
 
-__all__ = ["Failure", "describe_failure"]
+__all__ = ["FAILED", "INTERRUPTED", "Failure", "describe_failure"]
 
-_BAD_INPUT, _FAILED = 2, 1
+_BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130  # exit codes
 # Looked up by name, so that a command that never loaded torch does not load it to describe its error.
 _LAZY = {
     "data_gen.load": ("TargetsError", _BAD_INPUT),
-    "data_gen.blocks": ("WorkerError", _FAILED),
+    "data_gen.blocks": ("WorkerError", FAILED),
     "difflpv.io.exr": ("ImageError", _BAD_INPUT),
     "difflpv.config_file": ("ConfigFileError", _BAD_INPUT),
     "difflpv.fitted": ("FittedError", _BAD_INPUT),
@@ -45,7 +45,7 @@ def describe_failure(error: Exception) -> Failure | None:
         if module in sys.modules and isinstance(error, getattr(sys.modules[module], name)):
             return Failure(line, code)
     if isinstance(error, FloatingPointError):  # a solve says which value made it overflow
-        return Failure(line, _FAILED)
+        return Failure(line, FAILED)
     if isinstance(error, OSError) and error.filename is not None:
         return Failure(f"{error.filename}: {error.strerror}", _BAD_INPUT)
     if isinstance(error, FileNotFoundError):

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from difflpv.cli.failures import FAILED, INTERRUPTED
 from difflpv.cli.held_out import overfitting, peer_scores, unseen_scene, unseen_scores
 from difflpv.cli.options import (
     COMPONENTS,
@@ -57,7 +58,6 @@ LEARNABLES = (
 LOSSES = ("l2", "log", "image-l1", "image-ssim")
 _CELL_FIELDS = ("cell_propagation", "cell_occlusion")
 _OF_LIGHTS = ("light_intensity", "light_color", "light_position")
-_FAILED, _INTERRUPTED = 1, 130
 
 
 def add_parser(subparsers: Any) -> None:
@@ -152,8 +152,8 @@ def run(args: argparse.Namespace) -> int:
     else:
         print(_text(outcome, train_scores, test_scores, unseen, args.out))
     if outcome.result.status is Status.INTERRUPTED:
-        return _INTERRUPTED
-    return _FAILED if outcome.result.status in (Status.NON_FINITE, Status.FAILED) else 0
+        return INTERRUPTED
+    return FAILED if outcome.result.status in (Status.NON_FINITE, Status.FAILED) else 0
 
 
 def default_split(count: int) -> tuple[tuple[int, ...], tuple[int, ...]]:

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from difflpv.cli.failures import INTERRUPTED
 from difflpv.cli.options import COMPONENTS, UsageError, add_command, add_output, positive, positive_float, seeded, usage_errors
 from difflpv.cli.output import make_folder, print_json, warn
 
@@ -13,8 +14,6 @@ if TYPE_CHECKING:
     from difflpv.planning.race import Runner
 
 __all__ = ["add_parser", "run"]
-
-_INTERRUPTED = 130
 
 
 def add_parser(subparsers: Any) -> None:
@@ -87,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
         if plan.best is not None:
             print(f"\nplanning took {plan.seconds['all']:.0f} s, {plan.seconds['truth']:.0f} s of it for truth -> {args.out}")
     if plan.interrupted:
-        return _INTERRUPTED
+        return INTERRUPTED
     return 0 if plan.chosen is not None else 1
 
 

@@ -1,1 +1,1 @@
-"""Where to put light probes: every way of placing them behind one interface, and the judge of all of them."""
+"""Where to put light probes: every way of placing them behind one interface."""

@@ -21,7 +21,7 @@ from difflpv.optim.problem import Problem
 from difflpv.optim.result import HistoryPoint
 from difflpv.parameters import Parameter
 from difflpv.placement.journal import Journal, distinct
-from difflpv.placement.reconstruction import reconstruction_error
+from difflpv.placement.reconstruction import Content, reconstruction_error
 from difflpv.placement.task import Placement, PlacementTask, Progress
 from difflpv.placement.uniform import SPREADS, move_into_free_space, uniform_grids
 
@@ -43,7 +43,7 @@ def place_derivative_free(
     seconds: float | None = None,
     initial_step: float = 0.05,
     solid_penalty: float = 1.0,
-    content: Literal["field", "fitted"] = "field",
+    content: Content = "field",
 ) -> Placement:
     """Minimise the training error over positions without derivatives.
 
@@ -69,7 +69,7 @@ def place_derivative_free(
         raise ValueError(f"{solver} budget: expected at least 10 evaluations, got {budget}")
     grids = [grid for spread in SPREADS for grid in uniform_grids(task, count, spread, margin=0.1)[:1]]
     if not grids:
-        return journal.placement(np.empty((0, 3)))
+        raise journal.nothing_free()
     grid = min(grids, key=lambda g: journal.error(g.position))
     low, high = task.bounds
     edge = 1e-3 * (high - low).max()

@@ -17,7 +17,7 @@ import torch
 
 from difflpv.placement.journal import Journal
 from difflpv.placement.task import Placement, PlacementTask, Progress
-from difflpv.placement.uniform import uniform_grids
+from difflpv.placement.uniform import first_grid
 from difflpv.probes.probe_set import DIRECTIONS_26, irradiance_of
 from difflpv.probes.tetrahedra import Tetrahedra, TetrahedralInterpolation
 
@@ -56,10 +56,7 @@ def place_greedy_removal(
             "greedy_removal: expected dense in [1, 64], most >= 1, points >= 1, batch in [0, 0.5], "
             f"got {dense}, {most}, {points}, {batch}"
         )
-    grids = uniform_grids(task, max(count, min(most, round(dense * count))))
-    if not grids:
-        return journal.placement(np.empty((0, 3)))
-    position = grids[0].position
+    position = first_grid(journal, max(count, min(most, round(dense * count)))).position
     reader = _Reader(task, journal.radiance(position), points, seed)
     alive, rounds = np.arange(len(position)), 0
     while len(alive) > count:

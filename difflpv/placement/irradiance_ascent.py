@@ -17,7 +17,7 @@ import numpy as np
 from difflpv.placement.contrast import luminance
 from difflpv.placement.journal import Journal
 from difflpv.placement.task import Placement, PlacementTask, Progress
-from difflpv.placement.uniform import uniform_grids
+from difflpv.placement.uniform import first_grid
 from difflpv.probes.lattice import LatticeField
 from difflpv.probes.probe_set import DIRECTIONS_26, irradiance_of
 
@@ -78,10 +78,8 @@ def place_irradiance_ascent(
             "irradiance_ascent: expected max_iterations >= 0 and 0 < stop_step <= step, "
             f"got {max_iterations}, {stop_step}, {step}"
         )
-    grids = uniform_grids(task, max(1, round(initial * count)))
-    if not grids:
-        return journal.placement(np.empty((0, 3)))
-    start, spacing = grids[0].position, float(grids[0].spacing.min())
+    grid = first_grid(journal, max(1, round(initial * count)))
+    start, spacing = grid.position, float(grid.spacing.min())
     climbed = task.field if indirect is None else indirect
 
     def look(position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -57,6 +57,10 @@ class Journal:
         if self._progress is not None:
             self._progress(step, error, count)
 
+    def nothing_free(self) -> ValueError:
+        """The error where no probe is left."""
+        return ValueError(f"{self._method}: no probe lies in free space: check the clearance, or ask for more probes")
+
     def placement(self, position: np.ndarray, **details: Any) -> Placement:
         """The result.
 
@@ -64,7 +68,7 @@ class Journal:
             ValueError: no probe is left, because none lay in free space.
         """
         if not len(position):
-            raise ValueError(f"{self._method}: no probe lies in free space: check the clearance, or ask for more probes")
+            raise self.nothing_free()
         assert len(position) <= self._count
         seconds = time.perf_counter() - self._start
         return Placement(

@@ -18,7 +18,7 @@ import numpy as np
 from difflpv.placement.contrast import Contrast, ContrastKind
 from difflpv.placement.journal import Journal, distinct
 from difflpv.placement.task import Placement, PlacementTask, Progress
-from difflpv.placement.uniform import uniform_grids
+from difflpv.placement.uniform import first_grid
 
 __all__ = ["place_spawn_merge", "place_spawn_merge_hierarchical"]
 
@@ -73,10 +73,8 @@ def place_spawn_merge(
             "spawn_merge: expected 0 < closest < proximity, merge_ratio in [0, 1], max_iterations >= 1, "
             f"got {closest}, {proximity}, {merge_ratio}, {max_iterations}"
         )
-    grids = uniform_grids(task, max(1, round(initial * count)))
-    if not grids:
-        return journal.placement(np.empty((0, 3)))
-    start, spacing = grids[0].position, float(grids[0].spacing.max())
+    grid = first_grid(journal, max(1, round(initial * count)))
+    start, spacing = grid.position, float(grid.spacing.max())
     near, least = proximity * spacing, closest * spacing
     measure = Contrast(contrast, journal.radiance(start))
 

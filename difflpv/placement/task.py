@@ -15,20 +15,10 @@ from difflpv.probes.probe_set import COEFFS
 from difflpv.raycast import Raycaster
 from difflpv.scene import Scene
 
-__all__ = ["Placement", "PlacementTask", "Progress", "SurfaceTruth"]
+__all__ = ["Placement", "PlacementTask", "Progress"]
 
 Progress = Callable[[int, float, int], None]
 """Called with the step, the current training error (NaN where a method knows none) and the number of probes."""
-
-
-@dataclass(frozen=True, eq=False)
-class SurfaceTruth:
-    """Receivers on surfaces: ``position`` [r,3] m, ``normal`` [r,3], ``irradiance`` [r,C] W/m2, ``weight`` [r] (area)."""
-
-    position: torch.Tensor
-    normal: torch.Tensor
-    irradiance: torch.Tensor
-    weight: torch.Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +34,6 @@ class PlacementTask:
         field: radiance SH [9,C] W/m2 wherever a probe may go: what an unfitted probe holds.
         clearance: signed distance to the nearest surface [m], negative in solids and outside of the scene.
         weight: importance of each point [m]; ones if None.
-        surface: receivers on surfaces that count too, or None.
     """
 
     scene: Scene
@@ -53,7 +42,6 @@ class PlacementTask:
     field: LatticeField
     clearance: LatticeField
     weight: torch.Tensor | None = None
-    surface: SurfaceTruth | None = None
 
     def __post_init__(self) -> None:
         count = len(self.points)

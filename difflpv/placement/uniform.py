@@ -14,7 +14,7 @@ import numpy as np
 from difflpv.placement.journal import Journal
 from difflpv.placement.task import Placement, PlacementTask, Progress
 
-__all__ = ["SPREADS", "UniformGrid", "move_into_free_space", "place_grid", "place_grid_moved", "uniform_grids"]
+__all__ = ["SPREADS", "UniformGrid", "first_grid", "move_into_free_space", "place_grid", "place_grid_moved", "uniform_grids"]
 
 SPREADS = (1.0, 1.1, 1.2, 1.3)
 """Scales about the centre that are tried: probes at the centres of cells leave half a cell at the border uncovered."""
@@ -64,6 +64,18 @@ def uniform_grids(
             if finer:
                 return finer
     return plain
+
+
+def first_grid(journal: Journal, count: int) -> UniformGrid:
+    """The grid that an iteration starts from: the first of ``uniform_grids``.
+
+    Raises:
+        ValueError: no probe lies in free space.
+    """
+    grids = uniform_grids(journal.task, count)
+    if not grids:
+        raise journal.nothing_free()
+    return grids[0]
 
 
 def _grid(low: np.ndarray, high: np.ndarray, shape: tuple[int, int, int], spread: float) -> UniformGrid:
@@ -199,7 +211,7 @@ def _place(
             if best is None or error < best[0]:
                 best = error, grid
     if best is None:
-        return journal.placement(np.empty((0, 3)))
+        raise journal.nothing_free()
     error, grid = best
     dropped = int(np.prod(grid.shape)) - len(grid.position)
     return journal.placement(

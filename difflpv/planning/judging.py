@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from data_gen.receivers import draw_receivers
-from data_gen.targets import make_targets
 from difflpv.bench.configuration import Configuration
+from difflpv.bench.scenes import targets_in_grid
 from difflpv.blocking import Blocking
 from difflpv.config import grid_for
 from difflpv.evaluate import predict_constant
@@ -29,8 +28,6 @@ from difflpv.planning.estimate import ErrorSamples, Estimate
 from difflpv.planning.ladder import work_of
 from difflpv.scene import Scene
 from difflpv.stencil import LinearStencil
-
-_BIAS = 0.5  # cells, of injection (``difflpv.learnables``)
 
 __all__ = ["LEVELS", "Level", "SceneJudge"]
 
@@ -138,7 +135,7 @@ class SceneJudge:
             light = self._illuminate(rung, grid, lit)
             receivers = self._seen(rung, grid, light, truth, level, number)
             if rung.config.deposit == "visible":
-                light.vpl_cells(light.vpls(), _BIAS)  # rays of a light that has moved, no part of a solve; kept by it
+                light.vpl_cells(light.vpls())  # rays of a light that has moved, no part of a solve; kept by it
             for _ in range(1 + (self.levels[level].repeats if number == len(truth.lit) - 1 else 0)):
                 begin = clock()
                 solved = lpv.accumulate(light)
@@ -178,12 +175,9 @@ class SceneJudge:
     def _trace(self, level: int) -> _Truth:
         wanted, sets = self.levels[level], self.light_sets[: self.levels[level].lights]
         seed = self.seed + 1009 * (level + 1)
-        table = draw_receivers(self.scene, wanted.receivers, seed, within=grid_for(self.scene))
-        out = self.folder / f"truth_{level}"
-        out.mkdir(parents=True, exist_ok=True)
-        targets = make_targets(
-            self.scene, out, receivers=table, components=(self.component,), spp=wanted.spp, light_sets=sets, seed=seed,
-            workers=self.workers, overwrite=True, progress=False,
+        targets = targets_in_grid(
+            self.scene, self.folder / f"truth_{level}", components=(self.component,), receivers=wanted.receivers,
+            spp=wanted.spp, light_sets=sets, seed=seed, workers=self.workers,
         )  # fmt: skip
         irradiance = np.stack([t.irradiance[self.component].astype(float) for t in targets.lights])
         kept = [i for i in range(len(sets)) if irradiance[i].any()]

@@ -24,7 +24,7 @@ import torch
 from difflpv.probes.barycentric import barycentric_weights
 from difflpv.probes.rows import Rows
 
-__all__ = ["Tetrahedra", "TetrahedralInterpolation"]
+__all__ = ["Tetrahedra", "TetrahedralInterpolation", "box_corners"]
 
 _SHIFT = 1e-10  # of lifted heights; the lifted set has size 1
 _APEX = 10.0  # height of a point above all lifted ones: seen by no facet of the lower hull, and even four probes get a hull
@@ -184,7 +184,7 @@ class TetrahedralInterpolation:
         x = torch.as_tensor(position).detach().cpu().double().numpy()
         self._fresh = connectivity == "fresh"
         self._valid = None if valid is None else np.array(valid, bool)
-        self._corners = np.empty((0, 3)) if box is None else _corners(box)
+        self._corners = np.empty((0, 3)) if box is None else box_corners(box)
         self._nearest = np.zeros(0, np.int64)
         self.forget()
         self.triangulations = 0
@@ -239,7 +239,12 @@ class TetrahedralInterpolation:
         return Rows(found, weight)
 
 
-def _corners(box: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+def box_corners(box: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """The eight corners [8,3] m of a box, x alternating fastest, from its lowest and its highest corner [3] m.
+
+    Raises:
+        ValueError: naming what was expected and what came.
+    """
     low, high = (np.asarray(side, np.float64) for side in box)
     if low.shape != (3,) or high.shape != (3,) or not (low < high).all() or not np.isfinite([low, high]).all():
         raise ValueError(f"box: expected a lower and a higher corner [3], got {low.tolist()} and {high.tolist()}")

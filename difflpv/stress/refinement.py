@@ -8,6 +8,7 @@ import numpy as np
 
 from difflpv.grid import Grid
 from difflpv.illumination import Component
+from difflpv.leakage import dark_receivers
 from difflpv.pipeline import Lpv
 from difflpv.scene import Scene
 from difflpv.simulate import solve_irradiance
@@ -212,7 +213,8 @@ def _leak(name: str, share: float, lit: Lit, lpv: Lpv) -> Reading:
 def door(bench: Bench) -> Experiment:
     """The far room of two_rooms_90, which light enters by a door alone, in ever smaller cells."""
     case = bundled_case("two_rooms_90", bench.settings, bench.folder)
-    far = case.position[:, 0] > 0.06
+    far = dark_receivers("two_rooms_90", case.position)
+    assert far is not None
     beyond = replace(
         case,
         position=case.position[far],

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from difflpv.convolution import stencil_weight
 from difflpv.sh import coeff_count
 from difflpv.symmetry import cube_symmetries, neighborhood_offsets, sh_representation
 
@@ -70,13 +71,6 @@ def _pad(field: torch.Tensor, size: int, parities: torch.Tensor) -> torch.Tensor
     return padded
 
 
-def _weight(offsets: np.ndarray, matrices: torch.Tensor) -> torch.Tensor:
-    weight = matrices.new_zeros((matrices.shape[1], matrices.shape[2], 3, 3, 3))
-    for n, matrix in zip(offsets.tolist(), matrices, strict=True):
-        weight[:, :, 1 - n[2], 1 - n[1], 1 - n[0]] = matrix
-    return weight.contiguous(memory_format=torch.channels_last_3d)
-
-
 def _convolve(padded: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
     return torch.nn.functional.conv3d(padded.movedim(-1, 1), weight).movedim(1, -1)
 
@@ -115,7 +109,7 @@ class _Responses(torch.autograd.Function):
         ctx: Any, matrices: torch.Tensor, neighbors: int, l_max: int, size: int, stops: tuple[int, ...]
     ) -> torch.Tensor:
         offsets = neighborhood_offsets(neighbors)
-        weight = _weight(offsets, matrices)
+        weight = stencil_weight(offsets, matrices)
         parities = octant_parities(l_max).to(matrices.dtype)
         index = IMPULSES[l_max].index
         field = matrices.new_zeros((len(index), 1, 1, 1, matrices.shape[1]))
@@ -139,7 +133,7 @@ class _Responses(torch.autograd.Function):
     def backward(ctx: Any, bar: torch.Tensor) -> tuple[Any, ...]:
         (matrices,) = ctx.saved_tensors
         offsets, l_max, size, stops = ctx.setup
-        transposed = _weight(-offsets, matrices.transpose(1, 2))
+        transposed = stencil_weight(-offsets, matrices.transpose(1, 2))
         parities = octant_parities(l_max).to(matrices.dtype)
         share = torch.as_tensor(octant_multiplicity(size), dtype=matrices.dtype)[..., None]
         bar = bar / share  # per cell of the full cube, where the adjoint field has the symmetries of the field

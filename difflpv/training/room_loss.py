@@ -50,7 +50,7 @@ class RoomResponse:
         for component in _COMPONENTS:
             traced = illuminate(room.scene, room.grid, config, component)
             vpls = traced.vpls()
-            cells = traced.vpl_cells(vpls, 0.5)
+            cells = traced.vpl_cells(vpls)
             volume, _ = inject(vpls, room.grid, l_max=stencil.l_max, deposit="visible", open_cells=cells)
             truth = torch.as_tensor(room.irradiance[component], dtype=torch.float32)
             norm = (weight[:, None] * truth.square()).sum().sqrt()

@@ -20,6 +20,7 @@ from difflpv.io.atomic import write_json, write_text
 from difflpv.io.exports.convention import ExportError, convention_record, make_folder, rounded, usable_probes
 from difflpv.io.exports.plane_tree import EMPTY, plane_tree
 from difflpv.probes.probe_files import ProbeRecord
+from difflpv.probes.tetrahedra import box_corners
 
 __all__ = ["export_godot"]
 
@@ -44,7 +45,7 @@ def export_godot(record: ProbeRecord, out: Path) -> list[Path]:
     low, high = probes.position.min(0), probes.position.max(0)
     margin = max(1.0, float(np.linalg.norm(high - low)) / 4)
     low, high = low - margin, high + margin
-    corners = np.array([[(low, high)[k >> axis & 1][axis] for axis in range(3)] for k in range(8)])
+    corners = box_corners((low, high))
     nearest = np.linalg.norm(corners[:, None] - probes.position, axis=-1).argmin(1)
     # The tree is made for the numbers that Godot reads.
     points = np.concatenate([probes.position, corners]).astype(np.float32).astype(np.float64)

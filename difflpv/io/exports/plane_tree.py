@@ -8,7 +8,8 @@ Source: Fuchs, Kedem and Naylor, "On visible surface generation by a priori tree
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import Delaunay
+
+from difflpv.probes.tetrahedra import Tetrahedra
 
 __all__ = ["EMPTY", "plane_tree"]
 
@@ -19,17 +20,15 @@ _TRIED = 128  # planes for each node
 
 
 def plane_tree(points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Delaunay tetrahedra of ``points`` [n,3] and a tree that finds them.
+    """The tetrahedra of ``points`` [n,3] and a tree that finds them.
 
     Returns:
-        Tetrahedra [t,4] int (vertex indices), without those of no volume; planes [m,4] float32, unit normal and distance d of
+        Tetrahedra [t,4] int (vertex indices); planes [m,4] float32, unit normal and distance d of
         n.p = d; children [m,2] int, of points over the plane (n.p > d) and of the others: a later node, ``-1 - tetrahedron``,
         or ``EMPTY``.
     """
     span = float(np.ptp(points, axis=0).max())
-    corners = Delaunay(points).simplices
-    edges = points[corners[:, 1:]] - points[corners[:, :1]]
-    corners = corners[np.abs(np.linalg.det(edges)) > 1e-9 * span**3].astype(np.int64)
+    corners = Tetrahedra.of(points).vertices.astype(np.int64)
     planes = _face_planes(points, corners)
     tolerance = 1e-5 * span
     nodes: list[tuple[int, int, int]] = []
