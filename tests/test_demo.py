@@ -12,7 +12,7 @@ import difflpv.demo.run as run
 from data_gen.load import load_targets
 from difflpv.config import grid_for
 from difflpv.demo import DemoSettings, DemoSummary, run_demo
-from difflpv.demo.summary import code_digest, describe_targets, finished_summary, mean_rows
+from difflpv.demo.summary import PRESENTATION, code_digest, describe_targets, finished_summary, mean_rows
 from difflpv.evaluate import Score, score
 from difflpv.io import load_scene
 from difflpv.io.exr import read_image
@@ -169,8 +169,10 @@ def test_other_identity_or_damage_is_not_finished(tmp_path):
 
 
 def test_code_digest_sees_sources_and_leaves_out_what_is_named():
-    assert code_digest() == code_digest() != code_digest(without=run._PRESENTATION)
+    assert code_digest() == code_digest() != code_digest(without=PRESENTATION)
     assert len(code_digest()) == 64
+    with pytest.raises(ValueError, match="no source begins with difflpv/report_of_old/"):
+        code_digest(without=("difflpv/report/", "difflpv/report_of_old/"))
 
 
 def test_noise_is_the_error_of_a_perfect_prediction():

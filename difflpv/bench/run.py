@@ -21,16 +21,15 @@ from difflpv.bench.mitsuba_peer import unavailable
 from difflpv.bench.scenes import BUNDLED, BenchScene, bench_scenes
 from difflpv.bench.settings import BenchSettings
 from difflpv.bench.store import Store, points_csv
-from difflpv.demo.summary import code_digest, describe_machine
+from difflpv.demo.summary import PRESENTATION, code_digest, describe_machine
 from difflpv.io.atomic import write_json, write_text
 
 __all__ = ["BenchResult", "run_bench"]
 
 # Sources that change no number.
 _PRESENTATION = (
-    "difflpv/cli/", "difflpv/demo/", "difflpv/report/", "difflpv/stress/", "difflpv/probes/", "difflpv/placement/",
-    "difflpv/io/", "difflpv/bench/page.py", "difflpv/bench/run.py", "difflpv/bench/store.py", "difflpv/bench/pareto.py",
-    "difflpv/bench/baseline.py", "difflpv/bench/published.py", "difflpv/plan/",
+    *PRESENTATION, "difflpv/stress/", "difflpv/bench/page.py", "difflpv/bench/run.py", "difflpv/bench/store.py",
+    "difflpv/bench/pareto.py", "difflpv/bench/baseline.py", "difflpv/bench/published.py",
 )  # fmt: skip
 
 

@@ -18,6 +18,7 @@ from difflpv.demo.floor import judge_floor
 from difflpv.demo.settings import FITS, SCENE, UNFITTED, DemoSettings
 from difflpv.demo.speed import draw_speed
 from difflpv.demo.summary import (
+    PRESENTATION,
     DemoSummary,
     code_digest,
     describe_machine,
@@ -54,7 +55,6 @@ _IN_TABLE = (
 _IN_PICTURE = ("LPV fitted", "HOLPV", "HOLPV fitted", "learned_9x26", "learned_9x26 fitted")
 _IN_README = ("HOLPV", "HOLPV fitted", "learned_9x26 fitted")
 _README_DPI = 100  # keeps the file small
-_PRESENTATION = ("difflpv/cli/", "difflpv/demo/", "difflpv/report/")  # sources that change no fit
 Progress = Callable[[str], object]
 
 
@@ -89,7 +89,7 @@ def run_demo(
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
     identity = {"settings": asdict(sizes), "seed": seed, "code": code_digest()}
-    fit_code = code_digest(without=_PRESENTATION)
+    fit_code = code_digest(without=PRESENTATION)
     done = finished_summary(folder, identity)
     if done is not None:
         progress(f"{done.table}\n\nfinished before; report: {done.report}")

@@ -19,10 +19,23 @@ import numpy as np
 from data_gen.load import Targets
 from difflpv.evaluate import Score, format_scores, mean_score, relative_noise
 
-__all__ = ["DemoSummary", "code_digest", "describe_machine", "describe_targets", "finished_summary", "mean_rows"]
+__all__ = [
+    "PRESENTATION",
+    "DemoSummary",
+    "code_digest",
+    "describe_machine",
+    "describe_targets",
+    "finished_summary",
+    "mean_rows",
+]
 
 _SUMMARY, _REPORT = "summary.json", "report.html"
 _PACKAGES = ("torch", "warp-lang", "numpy", "embreex", "nlopt")
+PRESENTATION = (
+    "difflpv/cli/", "difflpv/demo/", "difflpv/report/", "difflpv/viewer/", "difflpv/shapes/", "difflpv/planning/",
+    "difflpv/probes/", "difflpv/placement/", "difflpv/io/exports/",
+)  # fmt: skip
+"""Sources that change no solve and no fit, for ``code_digest``."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,16 +95,23 @@ def code_digest(*, without: Sequence[str] = ()) -> str:
 
     Args:
         without: beginnings of paths such as "difflpv/report/" that do not matter.
+
+    Raises:
+        ValueError: one of ``without`` names no source.
     """
-    digest = hashlib.sha256()
+    digest, unused = hashlib.sha256(), set(without)
     for package in ("difflpv", "warp_kernels", "data_gen"):
         spec = importlib.util.find_spec(package)
         assert spec is not None and spec.submodule_search_locations
         root = Path(spec.submodule_search_locations[0])
         for path in sorted(root.rglob("*.py")):
             name = path.relative_to(root.parent).as_posix()
-            if not name.startswith(tuple(without)):
+            if name.startswith(tuple(without)):
+                unused = {beginning for beginning in unused if not name.startswith(beginning)}
+            else:
                 digest.update(name.encode() + path.read_bytes())
+    if unused:
+        raise ValueError(f"without: no source begins with {', '.join(sorted(unused))}")
     return digest.hexdigest()
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from difflpv.config import LpvConfig
-from difflpv.demo.summary import code_digest
+from difflpv.demo.summary import PRESENTATION, code_digest
 from difflpv.io.atomic import write_json
 from difflpv.stress.measure import Bench
 from difflpv.stress.page import write_page
@@ -21,7 +21,7 @@ from difflpv.stress.settings import STRESS_METHODS, StressSettings
 __all__ = ["run_stress"]
 
 # Sources that change no reading.
-_PRESENTATION = ("difflpv/cli/", "difflpv/demo/", "difflpv/report/", "difflpv/stress/page.py", "difflpv/stress/run.py")
+_PRESENTATION = (*PRESENTATION, "difflpv/bench/", "difflpv/stress/page.py", "difflpv/stress/run.py")
 
 
 def run_stress(
