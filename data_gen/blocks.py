@@ -14,9 +14,9 @@ import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from tqdm import tqdm
@@ -29,8 +29,8 @@ from difflpv.scene import Camera, Scene
 
 __all__ = ["Block", "BlockRunner", "BlockStore", "Job", "JobPart", "Quantity", "WorkerError", "round_samples"]
 
-Quantity = Literal["surface", "probes", "image"]
-_QUANTITIES: tuple[Quantity, ...] = ("surface", "probes", "image")
+Quantity = Literal["surface", "probes", "image", "lattice"]
+_QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)  # new ones go last: the place is part of a block's random numbers
 _BLOCK_PATHS = 2**17
 _MAX_SAMPLES = 16  # per replicate and round: 512 paths per entity
 
@@ -78,6 +78,7 @@ class Job:
         normals: receivers [n,3].
         probes: probe positions [m,3] m.
         camera: for images.
+        lattice: further probe positions [c,3] m, with random numbers of their own.
     """
 
     scenes: tuple[Scene, ...]
@@ -87,6 +88,7 @@ class Job:
     normals: np.ndarray
     probes: np.ndarray
     camera: Camera | None = None
+    lattice: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
 
 
 @dataclass(frozen=True, order=True)
@@ -145,8 +147,9 @@ def compute_block(job: Job, tracers: dict[int, PathTracer], block: Block) -> tup
     }
     if block.quantity == "surface":
         means = irradiance_block(tracer, job.positions[rows], job.normals[rows], part.components, **options)
-    elif block.quantity == "probes":
-        means = probe_block(tracer, job.probes[rows], part.components, **options)
+    elif block.quantity in ("probes", "lattice"):
+        positions = job.probes if block.quantity == "probes" else job.lattice
+        means = probe_block(tracer, positions[rows], part.components, **options)
     else:
         if job.camera is None:
             raise ValueError("image block: the job has no camera")

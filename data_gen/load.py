@@ -20,16 +20,20 @@ from difflpv.scene import Scene
 
 __all__ = [
     "FORMAT",
+    "KIND",
     "MANIFEST",
     "LightTargets",
     "Targets",
     "TargetsError",
+    "check_files",
+    "check_made_for",
     "file_digest",
     "load_targets",
     "read_manifest",
 ]
 
 MANIFEST = "manifest.json"
+KIND = "difflpv-targets"
 FORMAT = 1
 
 
@@ -87,12 +91,17 @@ class Targets:
 
     def check_scene(self, scene: Scene) -> None:
         """Raise a ``TargetsError`` unless these targets were made for ``scene``."""
-        made_for = self.manifest["request"]["scene"]
-        if made_for["hash"] != scene.hash:
-            raise TargetsError(
-                f"{self.folder}: targets belong to another scene: made for '{made_for['name']}' "
-                f"({made_for['hash'][:12]}), got '{scene.name}' ({scene.hash[:12]})"
-            )
+        check_made_for(scene, self.folder, self.manifest)
+
+
+def check_made_for(scene: Scene, folder: Path, manifest: dict[str, Any]) -> None:
+    """Raise a ``TargetsError`` unless the targets of this manifest were made for ``scene``."""
+    made_for = manifest["request"]["scene"]
+    if made_for["hash"] != scene.hash:
+        raise TargetsError(
+            f"{folder}: targets belong to another scene: made for '{made_for['name']}' "
+            f"({made_for['hash'][:12]}), got '{scene.name}' ({scene.hash[:12]})"
+        )
 
 
 def file_digest(path: Path) -> str:
@@ -100,11 +109,11 @@ def file_digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def read_manifest(folder: str | Path) -> dict[str, Any] | None:
+def read_manifest(folder: str | Path, kind: str = KIND) -> dict[str, Any] | None:
     """Manifest of a folder, None if it has none.
 
     Raises:
-        TargetsError: it is no manifest of this format.
+        TargetsError: it is no manifest of this kind and format.
     """
     path = Path(folder) / MANIFEST
     if not path.is_file():
@@ -113,13 +122,32 @@ def read_manifest(folder: str | Path) -> dict[str, Any] | None:
         manifest = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise TargetsError(f"{path}: damaged manifest: {' '.join(str(error).split())}") from None
-    if not isinstance(manifest, dict) or manifest.get("kind") != "difflpv-targets":
-        raise TargetsError(f"{path}: not a manifest of targets")
+    if not isinstance(manifest, dict) or manifest.get("kind") != kind:
+        raise TargetsError(f"{path}: not a manifest of {kind.removeprefix('difflpv-').replace('-', ' ')}")
     if manifest.get("format") != FORMAT:
         raise TargetsError(f"{path}: format {manifest.get('format')!r}, this version reads format {FORMAT}")
-    for key, kind in (("request", dict), ("files", dict), ("lights", list)):
-        if not isinstance(manifest.get(key), kind):
+    for key, expected in (("request", dict), ("files", dict), ("lights", list)):
+        if not isinstance(manifest.get(key), expected):
             raise TargetsError(f"{path}: damaged manifest: '{key}' is missing")
+    return manifest
+
+
+def check_files(folder: Path, kind: str = KIND) -> dict[str, Any]:
+    """Manifest of finished targets whose files are all there and unchanged.
+
+    Raises:
+        TargetsError: no targets there, or a file is missing or changed.
+    """
+    manifest = read_manifest(folder, kind)
+    if manifest is None:
+        reason = "no such folder" if not folder.is_dir() else f"no {MANIFEST}: not targets, or not finished"
+        raise TargetsError(f"{folder}: {reason}")
+    for name, digest in manifest["files"].items():
+        path = folder / name
+        if not path.is_file():
+            raise TargetsError(f"{path}: missing, the manifest names it")
+        if file_digest(path) != digest:
+            raise TargetsError(f"{path}: was changed since the targets were made, make them again")
     return manifest
 
 
@@ -133,16 +161,7 @@ def load_targets(folder: str | Path) -> Targets:
         TargetsError: no targets there, or a file is missing, damaged or changed.
     """
     folder = Path(folder)
-    manifest = read_manifest(folder)
-    if manifest is None:
-        reason = "no such folder" if not folder.is_dir() else f"no {MANIFEST}: not targets, or not finished"
-        raise TargetsError(f"{folder}: {reason}")
-    for name, digest in manifest["files"].items():
-        path = folder / name
-        if not path.is_file():
-            raise TargetsError(f"{path}: missing, the manifest names it")
-        if file_digest(path) != digest:
-            raise TargetsError(f"{path}: was changed since the targets were made, make them again")
+    manifest = check_files(folder)
     try:
         receivers = load_receivers(folder / "receivers.npz")
         lights = tuple(_load_light(folder, manifest, index) for index in range(len(manifest["lights"])))

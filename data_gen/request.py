@@ -5,17 +5,56 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
-from collections.abc import Mapping, Sequence
+import shutil
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import metadata
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
-from data_gen.load import FORMAT
+from data_gen.load import FORMAT, KIND, MANIFEST, TargetsError, file_digest, read_manifest
+from difflpv.io.atomic import write_json
 from difflpv.io.tables import ReceiverTable
+from difflpv.lights import apply_light_set
 from difflpv.scene import AreaLight, Camera, DirectionalLight, Scene, SpotLight
 
-__all__ = ["describe_request", "light_entries", "request_digest", "versions"]
+__all__ = [
+    "check_counts",
+    "describe_request",
+    "find_finished",
+    "finish",
+    "light_entries",
+    "make_folder",
+    "relit",
+    "request_digest",
+    "versions",
+]
+
+_Made = TypeVar("_Made")
+
+
+def check_counts(*rows: tuple[str, float | None, int, int | None]) -> None:
+    """A ``TargetsError`` unless each row's (name, value, least, most or None) value is an integer in range, or None."""
+    for name, value, least, most in rows:
+        if value is None:
+            continue
+        if int(value) != value or value < least:
+            raise TargetsError(f"{name}: expected an integer >= {least}, got {value}")
+        if most is not None and value > most:
+            raise TargetsError(f"{name}: expected at most {most}, got {value}")
+
+
+def relit(
+    scene: Scene, light_sets: Sequence[Sequence[Mapping[str, Any]]] | None
+) -> tuple[list[list[dict[str, Any]]], tuple[Scene, ...]]:
+    """Light sets as plain entries, and the scene under each; None for its own lights."""
+    if light_sets is None:
+        return [light_entries(scene)], (scene,)
+    if not light_sets:
+        raise TargetsError("light_sets: expected at least one light set, got none")
+    entries = [[dict(entry) for entry in light_set] for light_set in light_sets]
+    return entries, tuple(apply_light_set(scene, light_set) for light_set in light_sets)
 
 
 def describe_request(
@@ -54,6 +93,67 @@ def describe_request(
         "images": image,
         "seed": seed,
     }
+
+
+def find_finished(
+    out: Path, request: dict[str, Any], overwrite: bool, load: Callable[[Path], _Made], kind: str = KIND
+) -> _Made | None:
+    """Targets of this request that are there already, by ``load``; None where they have to be made.
+
+    Raises:
+        TargetsError: the folder holds targets of another request, or damaged ones, and is not to be overwritten.
+    """
+    try:
+        manifest = read_manifest(out, kind)
+        if manifest is None:
+            return None
+        if manifest["request"] == request:
+            return load(out)
+    except TargetsError:
+        if overwrite:
+            return None
+        raise
+    if overwrite:
+        return None
+    differing = [key for key in request if manifest["request"].get(key) != request[key]]
+    raise TargetsError(
+        f"{out}: holds targets of another request (different {', '.join(differing)}); "
+        "choose another folder or overwrite them"
+    )
+
+
+def make_folder(out: Path) -> None:
+    """The folder for targets; a ``TargetsError`` where it cannot be."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise TargetsError(f"{out}: cannot be made: {error.strerror}") from None
+
+
+def finish(
+    out: Path,
+    request: dict[str, Any],
+    lights: list[dict[str, Any]],
+    files: Iterable[Path],
+    *,
+    rays: int,
+    seconds: float,
+    kind: str = KIND,
+) -> None:
+    """Write the manifest, which makes targets finished, and drop their work blocks."""
+    manifest = {
+        "kind": kind,
+        "format": FORMAT,
+        "request": request,
+        "lights": lights,
+        "rays": rays,
+        "seconds": round(seconds, 3),
+        "versions": versions(),
+        "files": {path.name: file_digest(path) for path in files},
+    }
+    write_json(out / MANIFEST, manifest)
+    for folder in out.glob(".blocks-*"):  # also those of an abandoned request: this folder is taken now
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def request_digest(request: Mapping[str, Any]) -> str:

@@ -17,25 +17,20 @@ from difflpv.io.png import write_png
 from difflpv.io.tables import ReceiverTable, save_receivers, save_table
 from difflpv.lights import behind_light_weight
 
-__all__ = ["TargetRun"]
+__all__ = ["JobRun", "TargetRun"]
 
 
-class TargetRun:
+class JobRun:
     """One run of a job: rounds of blocks, and what they add up to.
 
     Attributes:
-        rays: traced for what was written so far.
+        rays: traced for what was counted so far.
         seconds: processor time of the same blocks.
     """
 
-    def __init__(self, runner: BlockRunner, receivers: ReceiverTable) -> None:
-        self.runner, self.job, self.store, self.receivers = runner, runner.job, runner.store, receivers
+    def __init__(self, runner: BlockRunner) -> None:
+        self.runner, self.job, self.store = runner, runner.job, runner.store
         self.rays, self.seconds = 0, 0.0
-        self.weights: list[np.ndarray] = []
-        for scene in self.job.scenes:
-            weight = np.array(receivers.area_weight)
-            weight[behind_light_weight(scene, receivers.position)] = 0
-            self.weights.append(weight)
 
     def compute(self, quantity: Quantity, rounds: Sequence[int]) -> None:
         """Have blocks of ``rounds`` [lights] rounds computed."""
@@ -67,6 +62,19 @@ class TargetRun:
         return Estimate(
             np.concatenate([p.mean for p in parts]), np.concatenate([p.standard_error for p in parts])
         )
+
+
+class TargetRun(JobRun):
+    """A run with receivers: goes on to a standard error, writes tables and images."""
+
+    def __init__(self, runner: BlockRunner, receivers: ReceiverTable) -> None:
+        super().__init__(runner)
+        self.receivers = receivers
+        self.weights: list[np.ndarray] = []
+        for scene in self.job.scenes:
+            weight = np.array(receivers.area_weight)
+            weight[behind_light_weight(scene, receivers.position)] = 0
+            self.weights.append(weight)
 
     def errors(self, estimate: Estimate, light: int) -> dict[str, float]:
         """Mean standard error over mean, per component, over receivers that have a weight."""

@@ -8,7 +8,6 @@ same tables, bit for bit, for any number of workers.
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,14 +18,12 @@ from data_gen.blocks import BlockRunner, BlockStore, Job, JobPart, Quantity, rou
 from data_gen.components import Components
 from data_gen.estimators import REPLICATES
 from data_gen.freespace import draw_probes
-from data_gen.load import FORMAT, MANIFEST, Targets, TargetsError, file_digest, load_targets, read_manifest
+from data_gen.load import Targets, TargetsError, load_targets
 from data_gen.receivers import draw_receivers
-from data_gen.request import describe_request, light_entries, request_digest, versions
+from data_gen.request import check_counts, describe_request, find_finished, finish, make_folder, relit, request_digest
 from data_gen.rng import MAX_SAMPLES
 from data_gen.run import TargetRun
-from difflpv.io.atomic import write_json
 from difflpv.io.tables import ReceiverTable
-from difflpv.lights import apply_light_set
 from difflpv.scene import Scene
 
 __all__ = ["DEFAULT_COMPONENTS", "MAX_SPP", "PROBE_COMPONENTS", "make_targets"]
@@ -98,14 +95,7 @@ def make_targets(
         raise TargetsError(str(error)) from None
     if images and not scene.cameras:
         raise TargetsError(f"scene '{scene.name}': no camera, images need one")
-    lit_scenes: tuple[Scene, ...] = (scene,)
-    if light_sets is None:
-        entries = [light_entries(scene)]
-    elif light_sets:
-        entries = [[dict(entry) for entry in light_set] for light_set in light_sets]
-        lit_scenes = tuple(apply_light_set(scene, light_set) for light_set in light_sets)
-    else:
-        raise TargetsError("light_sets: expected at least one light set, got none")
+    entries, lit_scenes = relit(scene, light_sets)
     camera = scene.cameras[0] if images else None
     request = describe_request(
         scene,
@@ -122,13 +112,10 @@ def make_targets(
         seed=seed,
     )
     out = Path(out_dir)
-    finished = _finished(out, request, overwrite)
+    finished = find_finished(out, request, overwrite, load_targets)
     if finished is not None:
         return finished
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise TargetsError(f"{out}: cannot be made: {error.strerror}") from None
+    make_folder(out)
     if receivers is None:
         receivers = draw_receivers(scene, receiver_count or 4000, seed)
     samples, rounds = round_samples(spp if spp is not None else max_spp)
@@ -163,24 +150,12 @@ def make_targets(
     files, summary = run.write(out, surface_rounds, extra_rounds)
     for light, light_summary in enumerate(summary):
         light_summary["entries"] = entries[light]
-    manifest = {
-        "kind": "difflpv-targets",
-        "format": FORMAT,
-        "request": request,
-        "lights": summary,
-        "rays": run.rays,
-        "seconds": round(run.seconds, 3),
-        "versions": versions(),
-        "files": {path.name: file_digest(path) for path in files},
-    }
-    write_json(out / MANIFEST, manifest)
-    for folder in out.glob(".blocks-*"):  # also those of an abandoned request: this folder is taken now
-        shutil.rmtree(folder, ignore_errors=True)
+    finish(out, request, summary, files, rays=run.rays, seconds=run.seconds)
     return load_targets(out)
 
 
 def _check_counts(spp, target_error, max_spp, probes, probe_spp, image_spp, seed, workers, receiver_count) -> None:
-    for name, value, least, most in (
+    check_counts(
         ("spp", spp, 1, MAX_SPP),
         ("max_spp", max_spp, 1, MAX_SPP),
         ("probes", probes, 0, None),
@@ -189,33 +164,6 @@ def _check_counts(spp, target_error, max_spp, probes, probe_spp, image_spp, seed
         ("seed", seed, 0, None),
         ("workers", workers, 1, None),
         ("receiver_count", receiver_count, 1, None),
-    ):
-        if value is None:
-            continue
-        if int(value) != value or value < least:
-            raise TargetsError(f"{name}: expected an integer >= {least}, got {value}")
-        if most is not None and value > most:
-            raise TargetsError(f"{name}: expected at most {most}, got {value}")
+    )
     if target_error is not None and not 0 < target_error < 1:
         raise TargetsError(f"target_error: expected a share between 0 and 1, got {target_error}")
-
-
-def _finished(out: Path, request: dict[str, Any], overwrite: bool) -> Targets | None:
-    """Targets that are there already; an error for those of another request."""
-    try:
-        manifest = read_manifest(out)
-        if manifest is None:
-            return None
-        if manifest["request"] == request:
-            return load_targets(out)
-    except TargetsError:
-        if overwrite:
-            return None
-        raise
-    if overwrite:
-        return None
-    differing = [key for key in request if manifest["request"].get(key) != request[key]]
-    raise TargetsError(
-        f"{out}: holds targets of another request (different {', '.join(differing)}); "
-        "choose another folder or overwrite them"
-    )
