@@ -1,4 +1,4 @@
-"""``difflpv probes``: the group and its export."""
+"""``difflpv probes``: the group, its targets and its export."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_room import difflpv
+from cli_room import difflpv, write_room
 
+from data_gen.probe_targets import load_probe_targets
 from difflpv.cli.probes import SUBCOMMANDS
 from difflpv.cli.probes.export import FORMATS
 from difflpv.io.exports import EXPORT_FORMATS
@@ -80,3 +81,41 @@ def test_errors_are_one_line(arguments, message, folder, tmp_path, capsys) -> No
 def test_no_probes_there_is_one_line(tmp_path, capsys) -> None:
     assert difflpv("probes", "export", tmp_path, "--format", "gltf", "--out", tmp_path / "a.gltf") == 2
     assert capsys.readouterr().err.startswith(f"difflpv: error: {tmp_path / 'probes.json'}: not found: expected a folder")
+
+
+TINY = ("--count", 6, "--cells", 3, "--spp", 32, "--lattice-spp", 32)
+
+
+def test_targets_are_made_once_under_the_lights_that_are_named(tmp_path, capsys) -> None:
+    scene, out = write_room(tmp_path), tmp_path / "made"
+    for recognised in (False, True):
+        assert difflpv("probes", "targets", scene, "--lights", tmp_path / "sets.json", *TINY, "--out", out, "--json") == 0
+        told = json.loads(capsys.readouterr().out)
+        assert (told["points"], told["surface_points"], told["recognised"]) == (6, 2, recognised)
+        assert len(told["lights"]) == 4 and told["component"] == "bounce1"
+    made = load_probe_targets(out)
+    assert [entries[0]["radiance"] for entries in made.light_sets] == [[8.0 - k, 6.0, 4.0 + k] for k in range(4)]
+    assert told["cells"] == list(made.grid.resolution) and told["free_cells"] == made.free.sum()
+    assert difflpv("probes", "targets", scene, *TINY, "--out", out) == 2  # under its own lights: another request
+    assert "another request (different lights)" in capsys.readouterr().err
+    for lights, sets in (("3", 3), ("own", 1)):  # none are bundled with this room: its own, moved
+        assert difflpv("probes", "targets", scene, "--lights", lights, *TINY, "--out", out, "--overwrite") == 0
+        text = capsys.readouterr().out
+        assert f"written: bounce1 of {sets} light set(s)" in text and "6 points, 2 of them over surfaces" in text
+        assert len({repr(entries) for entries in load_probe_targets(out).light_sets}) == sets
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--lights", "0"], "--lights: expected a whole number >= 1, got '0'"),
+        (["--lights", "bundled"], "no light sets for scene 'room'"),
+        (["--surface-share", "1.5"], "--surface-share: expected a share from 0 to 1, got '1.5'"),
+        (["--component", "bounce"], "component 'bounce': expected direct, bounce1"),
+    ],
+)
+def test_errors_of_targets_are_one_line(arguments, message, tmp_path, capsys) -> None:
+    assert difflpv("probes", "targets", write_room(tmp_path), *arguments, *TINY, "--out", tmp_path / "made") == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+    assert not (tmp_path / "made").exists()
