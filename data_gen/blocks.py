@@ -7,8 +7,6 @@ finished block is a file, so that an interrupted run goes on where it stopped.
 
 from __future__ import annotations
 
-import multiprocessing
-import signal
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -24,6 +22,7 @@ from tqdm import tqdm
 from data_gen.components import Components
 from data_gen.estimators import REPLICATES, image_block, irradiance_block, probe_block
 from data_gen.pathtracer import PathTracer
+from data_gen.workers import start_pool
 from difflpv.io.tables import TableError, load_table, save_table
 from difflpv.scene import Camera, Scene
 
@@ -162,7 +161,6 @@ _worker: tuple[Job, dict[int, PathTracer]] | None = None
 
 def _start_worker(job: Job) -> None:
     global _worker
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     _worker = (job, {})
 
 
@@ -242,10 +240,7 @@ class BlockRunner:
                 yield block, compute_block(self.job, self._tracers, block)
             return
         if self._pool is None:
-            context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(
-                self._workers, mp_context=context, initializer=_start_worker, initargs=(self.job,)
-            )
+            self._pool = start_pool(self._workers, _start_worker, self.job)
         futures = {self._pool.submit(_work, block): block for block in missing}
         for future in as_completed(futures):
             yield futures.pop(future), future.result()  # popped: thousands of results would pile up here

@@ -7,10 +7,7 @@ floor of every table. ``kept_volume`` path-traces it once and finds it again on 
 from __future__ import annotations
 
 import hashlib
-import multiprocessing
-import signal
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,6 +17,7 @@ from data_gen.blocks import round_samples
 from data_gen.components import Components
 from data_gen.estimators import REPLICATES, probe_block
 from data_gen.pathtracer import PathTracer
+from data_gen.workers import start_pool
 from difflpv.grid import Grid
 from difflpv.io.tables import TableError, load_table, save_table
 from difflpv.scene import AreaLight, Scene
@@ -119,8 +117,7 @@ def kept_volumes(
         KeyboardInterrupt: passed on; volumes that are finished are kept.
     """
     if workers > 1 and len(scenes) > 1:
-        spawn = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(min(workers, len(scenes)), mp_context=spawn, initializer=_leave_interrupt_to_parent)
+        pool = start_pool(min(workers, len(scenes)))
         try:
             jobs = [pool.submit(kept_volume, folder, scene, grid, component, spp=spp, seed=seed) for scene in scenes]
             for job in jobs:
@@ -128,10 +125,6 @@ def kept_volumes(
         finally:
             pool.shutdown(cancel_futures=True)
     return [kept_volume(folder, scene, grid, component, spp=spp, seed=seed) for scene in scenes]
-
-
-def _leave_interrupt_to_parent() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def find_volume(folder: str | Path, scene: Scene, grid: Grid, component: str) -> TrueVolume | None:

@@ -5,7 +5,6 @@ Targets with their standard errors are ``data_gen.targets``.
 
 from __future__ import annotations
 
-import multiprocessing
 from concurrent.futures import ProcessPoolExecutor
 
 import numpy as np
@@ -13,6 +12,7 @@ import numpy as np
 from data_gen.components import Components
 from data_gen.estimators import irradiance_block
 from data_gen.pathtracer import PathTracer
+from data_gen.workers import start_pool
 from difflpv.scene import Scene
 
 __all__ = ["PathPool", "trace_paths"]
@@ -44,7 +44,7 @@ class PathPool:
         self._own = PathTracer(scene) if workers == 1 else None
         self._pool: ProcessPoolExecutor | None = None
         if workers > 1:
-            self._pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _start, (scene,))
+            self._pool = start_pool(workers, _start, scene)
 
     def trace(self, position: np.ndarray, normal: np.ndarray, component: str, *, samples: int, seed: int) -> np.ndarray:
         """As ``trace_paths``; the bits depend on the number of workers."""

@@ -1,5 +1,6 @@
 """``difflpv view``: its options, its picture, and its page in a real browser."""
 
+import argparse
 import io
 import json
 import re
@@ -16,6 +17,7 @@ from chromium import Browser, find_chromium
 from cli_room import difflpv, make_targets, write_room
 from PIL import Image
 
+from difflpv.cli import view
 from difflpv.config import LpvConfig, grid_for
 from difflpv.io import load_scene
 from difflpv.io.srgb import linear_to_srgb
@@ -34,6 +36,16 @@ ROOM = ("--method", "learned_9x6", "--grid", 6, "--steps", 5, "--facets", 100)
 @pytest.fixture
 def room(tmp_path):
     return write_room(tmp_path)
+
+
+def test_probe_grid_leaves_solids_out_however_they_are_wound():
+    scene, asked = load_scene("cornell"), argparse.Namespace(probes=None, probe_grid=8)
+    kept = view._probes(asked, scene).position
+    short = (np.abs(kept - [0.89, 0.8, 1.06]) < [0.6, 0.6, 0.6]).all(1)  # well within the short block
+    assert not short.any() and 400 < len(kept) < 512
+    turned = replace(scene, meshes=tuple(replace(m, triangles=m.triangles[:, ::-1]) for m in scene.meshes))
+    turned = turned.with_lights([replace(light, two_sided=True) for light in scene.lights])
+    np.testing.assert_array_equal(view._probes(asked, turned).position, kept)
 
 
 @pytest.mark.slow

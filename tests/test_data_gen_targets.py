@@ -1,6 +1,7 @@
 """Targets on disk: equal bits, resume, recognition, messages, files."""
 
 import json
+import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -10,6 +11,7 @@ import pytest
 
 from data_gen import blocks
 from data_gen.blocks import Block, BlockRunner, BlockStore, WorkerError, round_samples
+from data_gen.few_paths import PathPool
 from data_gen.load import TargetsError, load_targets
 from data_gen.receivers import draw_receivers
 from data_gen.targets import make_targets
@@ -258,6 +260,18 @@ def test_dead_worker_is_told(cornell, tmp_path):
         BlockRunner(job, BlockStore(tmp_path), workers=2) as runner,
     ):
         runner.run([Block(0, "surface", 0, 0)], "surface")
+
+
+@pytest.mark.slow
+def test_workers_leave_ctrl_c_to_their_parent():
+    """A terminal sends it to all processes at once; a worker that died of it would take its block along."""
+    pool = PathPool(load_scene("cornell"), workers=2)
+    try:
+        assert pool._pool.submit(signal.getsignal, signal.SIGINT).result() == signal.SIG_IGN
+        x = np.array([[0.0, 1.0, 0.0], [0.5, 1.0, 0.0]])
+        assert pool.trace(x, np.array([[0, 1.0, 0]] * 2), "direct", samples=4, seed=0).shape == (2, 3)
+    finally:
+        pool.close()
 
 
 def test_workers_start_without_torch_warp_and_scipy():

@@ -206,5 +206,8 @@ def _probes(args: argparse.Namespace, scene: Scene) -> ProbeView:
         return ProbeView.of(load_probes(args.probes).probes)
     if args.probe_grid is None:
         return ProbeView.of(np.zeros((0, 3)))
+    from data_gen.freespace import is_free
+
     with usage_errors():
-        return ProbeView.of(lattice_positions(scene, args.probe_grid))
+        points = lattice_positions(scene, args.probe_grid)
+    return ProbeView.of(points[is_free(scene, points)])

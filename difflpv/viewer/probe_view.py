@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from difflpv.probes.probe_set import DIRECTIONS_26, ProbeSet
+from difflpv.probes.probe_set import ProbeSet
 from difflpv.probes.tetrahedra import Tetrahedra
-from difflpv.raycast import Raycaster
 from difflpv.scene import Scene
 
 __all__ = ["ProbeView", "lattice_positions"]
@@ -47,10 +46,9 @@ class ProbeView:
 
 
 def lattice_positions(scene: Scene, per_side: int) -> np.ndarray:
-    """Centres [n,3] m of a lattice over the scene's bounds, ``per_side`` along the longest edge, outside of solids.
+    """Centres [n,3] m of a lattice over the scene's bounds, ``per_side`` along the longest edge, those in solids too.
 
-    A centre counts as inside a solid if 26 rays from it all meet the scene, and most of them backs of triangles. Where that is
-    so of every centre, the room is wound inside out and they all stay.
+    Which of them are in free space is the path tracer's to tell (``data_gen.freespace.is_free``).
 
     Raises:
         ValueError: fewer than one along the longest edge.
@@ -61,10 +59,4 @@ def lattice_positions(scene: Scene, per_side: int) -> np.ndarray:
     size = high - low
     count = np.maximum(np.round(per_side * size / size.max()), 1).astype(int)
     axes = [low[a] + size[a] * (np.arange(count[a]) + 0.5) / count[a] for a in range(3)]
-    points = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    rays = np.tile(DIRECTIONS_26, (len(points), 1))
-    n = len(points)
-    hits = Raycaster(scene).closest(np.repeat(points, len(DIRECTIONS_26), axis=0), rays)
-    back = hits.valid & ((scene.triangle_normals[hits.triangle] * rays).sum(1) > 0)
-    solid = hits.valid.reshape(n, -1).all(1) & (back.reshape(n, -1).mean(1) > 0.5)  # a box may stand on a floor of its own
-    return points if solid.all() else points[~solid]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
