@@ -46,8 +46,9 @@ class ProbeTargets:
 
     Attributes:
         folder: where they lie.
-        points: [m,3] m, at least ``data_gen.freespace.default_clearance`` off every surface and in no solid: first those
-            uniform in the free space, then those over surfaces, uniform by area. Neither part is sorted along the scene.
+        points: [m,3] m within the scene's bounds, at least ``data_gen.freespace.default_clearance`` off every surface and in
+            no solid: first those uniform in the free space, then those over surfaces, uniform by area. Neither part is sorted
+            along the scene.
         surface_count: how many of the last points lie over surfaces.
         radiance: radiance SH of each light set at the points, toward the incoming light [L,m,9,3] W/m2, float32.
         standard_error: of ``radiance``.
@@ -264,12 +265,14 @@ def _draw_points(scene: Scene, in_space: int, on_surfaces: int, seed: int) -> np
     points = draw_probes(scene, in_space, seed) if in_space else np.empty((0, 3))
     if not on_surfaces:
         return points
-    clearance, drawn = default_clearance(scene.bounds), on_surfaces
+    (low, high), drawn = scene.bounds, on_surfaces
+    clearance = default_clearance((low, high))
     for attempt in range(_ATTEMPTS):
         receivers = draw_receivers(scene, drawn, seed)
         lifted = receivers.position + clearance * receivers.normal
         # their own surface is that far away up to rounding; corners and gaps have others nearer
         clear = triangle_distance(scene.triangle_vertices, lifted) >= (1 - 1e-6) * clearance
+        clear &= ((lifted >= low) & (lifted <= high)).all(1)  # the sunlit outside of a house is not where probes are wanted
         clear[clear] = is_free(scene, lifted[clear], seed)
         kept = np.flatnonzero(clear)
         if len(kept) >= on_surfaces:

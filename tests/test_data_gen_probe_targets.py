@@ -67,6 +67,8 @@ def test_sun_has_exact_coefficients_where_it_shines_and_none_in_the_shadow(tmp_p
         assert lit(x).any() and not lit(x).all()
         np.testing.assert_allclose(radiance, lit(x)[:, None, None] * expected, rtol=1e-6, atol=1e-6)
     assert not made.standard_error.any()
+    low, high = CAMP.bounds  # neither over the roof nor under the floor
+    assert ((made.points > low) & (made.points < high)).all() and made.surface_count == 20
     assert made.free.sum() == np.prod(np.array(made.grid.resolution) - 2)  # all cells within the bounds of an open scene
 
 
