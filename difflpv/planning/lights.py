@@ -10,7 +10,7 @@ from difflpv.lights import load_light_sets
 from difflpv.raycast import Raycaster
 from difflpv.scene import AreaLight, DirectionalLight, Scene, SceneError, SpotLight
 
-__all__ = ["held_out_lights", "moved_lights"]
+__all__ = ["held_out_lights", "moved_light_sets", "moved_lights"]
 
 _TURN = 0.3  # rad, the largest turn of a directional light
 _SHIFT = 0.12  # of the scene's extent, the largest shift of the others
@@ -34,6 +34,11 @@ def held_out_lights(scene: Scene, count: int, *, seed: int = 0) -> list[list[dic
     if bundled and all(entry.get("mesh", next(iter(meshes))) in meshes for entries in bundled for entry in entries):
         picked = np.unique(np.linspace(0, len(bundled) - 1, count).round().astype(int))
         return [bundled[i] for i in picked]
+    return moved_light_sets(scene, count, seed=seed)
+
+
+def moved_light_sets(scene: Scene, count: int, *, seed: int = 0) -> list[list[dict[str, Any]]]:
+    """The scene's own lights, then moved ones (``moved_lights``): ``count`` sets, fewer where lights cannot be moved."""
     random = np.random.default_rng([seed, 7])
     sets = [moved_lights(scene, random, moved=k > 0) for k in range(count)]
     unique = {repr(entries): entries for entries in sets}  # lights that cannot be moved come once

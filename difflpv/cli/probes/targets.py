@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 __all__ = ["add_parser", "run"]
 
+_MOVED = "moved:"
+
 
 def add_parser(subparsers: Any) -> None:
     """Add the subcommand."""
@@ -50,7 +52,8 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument(
         "--lights", default="own", metavar="LIGHTS",
         help="own: the scene's; bundled: the package's light sets; SETS.json: those of a file; a number: so many, spread over "
-        "the bundled ones, or the scene's own moved a little where none are bundled (default: %(default)s)",
+        "the bundled ones, or the scene's own moved a little where none are bundled; moved:N: so many in any scene, its own "
+        "lights first, then moved ones (default: %(default)s)",
     )  # fmt: skip
     parser.add_argument("--workers", type=positive, default=1, metavar="N", help="processes (default: %(default)s)")
     parser.add_argument("--overwrite", action="store_true", help="replace targets of another request in DIR")
@@ -67,7 +70,8 @@ def run(args: argparse.Namespace) -> int:
     scene = load_scene(args.scene)
     sets = _light_sets(args, scene)
     warnings = [*scene.warnings]
-    if args.lights.isdigit() and sets is not None and len(sets) < int(args.lights):
+    wanted = args.lights.removeprefix(_MOVED)
+    if wanted.isdigit() and sets is not None and len(sets) < int(wanted):
         warnings.append(f"--lights {args.lights}: scene '{scene.name}' has only {len(sets)} different light set(s)")
     warn(warnings)
     manifest = args.out / MANIFEST
@@ -109,17 +113,18 @@ def _light_sets(args: argparse.Namespace, scene: Scene) -> list[Any] | None:
     """Light sets that ``--lights`` names; None for the scene's own lights."""
     if args.lights == "own":
         return None
-    if not args.lights.isdigit():
+    moved, wanted = args.lights.startswith(_MOVED), args.lights.removeprefix(_MOVED)
+    if not moved and not wanted.isdigit():
         named = light_sets(argparse.Namespace(lights=args.lights, light=None), scene)
         assert named is not None
         return list(named[1])
-    from difflpv.planning.lights import held_out_lights
+    from difflpv.planning.lights import held_out_lights, moved_light_sets
 
     try:
-        count = positive(args.lights)
+        count = positive(wanted)
     except argparse.ArgumentTypeError as error:
         raise UsageError(f"--lights: {error}") from None
-    return held_out_lights(scene, count, seed=args.seed)
+    return (moved_light_sets if moved else held_out_lights)(scene, count, seed=args.seed)
 
 
 def _record(targets: ProbeTargets) -> dict[str, Any]:
