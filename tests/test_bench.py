@@ -9,8 +9,9 @@ import pytest
 import torch
 
 from difflpv.bench.baseline import compare, ratios, read_baseline
-from difflpv.bench.breakeven import crossing, equal_paths
+from difflpv.bench.breakeven import crossing
 from difflpv.bench.configuration import Configuration, chosen
+from difflpv.bench.equal_error import equal_paths
 from difflpv.bench.growth import exponent
 from difflpv.bench.images import flip, flip_unavailable
 from difflpv.bench.measure import Point, errors

@@ -1,7 +1,7 @@
 """From how many receivers on a solve pays: time over their number at equal error, against path tracers.
 
 The cheapest learned configuration that meets ``EQUAL_ERROR`` is compared with as many paths per receiver as give the error
-that it has. Paths come in powers of two: their time is scaled from the nearest measured power, to which it is proportional.
+that it has (``difflpv.bench.equal_error``).
 """
 
 from __future__ import annotations
@@ -12,37 +12,21 @@ from typing import Any
 import numpy as np
 
 from data_gen.few_paths import PathPool
-from difflpv.bench.configuration import LADDER, Configuration
+from difflpv.bench.configuration import LADDER
+from difflpv.bench.equal_error import EqualTracer
 from difflpv.bench.measure import Point, prepare
-from difflpv.bench.mitsuba_peer import MitsubaRun, unavailable
+from difflpv.bench.mitsuba_peer import MitsubaRun
 from difflpv.bench.scenes import BenchScene
 from difflpv.bench.settings import BenchSettings
 from difflpv.bench.timing import interleaved, timed
-from difflpv.bench.tracers import PathRun
 from difflpv.bench.volume import VolumeRun
 
-__all__ = ["EQUAL_ERROR", "crossing", "equal_paths", "measure_break_even"]
+__all__ = ["EQUAL_ERROR", "crossing", "measure_break_even"]
 
 EQUAL_ERROR = 0.2
 COUNTS = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000, 10_000_000)
 GRADIENT_COUNTS = (1_000, 10_000, 100_000)
-_MOST_PATHS = 1 << 20  # traced at a time: beyond that, time is proportional to receivers
 _CHUNK = 1 << 18
-
-
-def equal_paths(points: Sequence[Point], family: str, error: float) -> float | None:
-    """Paths per receiver at which a path tracer has this error, by log-log interpolation of its points; None without any.
-
-    Beyond its points noise falls as one over the root of the paths.
-    """
-    samples = {c.name: c.samples for c in LADDER}
-    own = sorted((samples[p.name] or 1, p.error) for p in points if p.family == family)
-    if not own:
-        return None
-    n, e = np.log([k for k, _ in own]), np.log([v for _, v in own])
-    if np.log(error) < e[-1]:
-        return float(np.exp(n[-1] + 2 * (e[-1] - np.log(error))))
-    return float(np.exp(np.interp(-np.log(error), -e, n)))
 
 
 def crossing(counts: Sequence[int], ours: Sequence[float], theirs: Sequence[float]) -> float | None:
@@ -74,8 +58,8 @@ def measure_break_even(
         what has changed, ``peers`` with their paths, seconds, break-even and speed-up; None where nothing meets 0.2.
     """
     by_name = {c.name: c for c in LADDER}
-    # fit, geometry and sight belong to a scene, not to a solve: they are told apart, not counted here
-    able = [p for p in points if p.family == "learned" and p.error <= EQUAL_ERROR and p.solve is not None]
+    # fits are the pay-off's question (difflpv.bench.payoff)
+    able = [p for p in points if p.family == "learned" and p.error <= EQUAL_ERROR and p.solve and "fit" not in p.setup_seconds]
     if not able:
         return None
     best = min(able, key=lambda p: (p.seconds or 0) + p.lights_seconds)
@@ -95,25 +79,18 @@ def measure_break_even(
         if n in parts or n == chunk:
             own = parts.get(n, seen)
             calls[f"both {n}"] = lambda own=own: run.both(own)
-    peers: dict[str, dict[str, Any]] = {}
-    tracers: dict[str, tuple[PathRun | MitsubaRun, int, int]] = {}
-    for family, kind in (("path tracer", "paths"), ("Mitsuba 3", "mitsuba")):
-        paths = equal_paths(points, family, best.error)
-        if paths is None or (kind == "mitsuba" and unavailable()):
+    tracers: dict[str, EqualTracer] = {}
+    for family in ("path tracer", "Mitsuba 3"):
+        tracer = EqualTracer.of(points, family, best.error, scene, most=settings.most_receivers, pool=pool)
+        if tracer is None:
             continue
-        power = max(1, 1 << round(np.log2(paths)))
-        configuration = Configuration(family, kind, family, samples=power)  # type: ignore[arg-type]
-        tracer = prepare(configuration, scene, pool=pool)
-        assert isinstance(tracer, (PathRun, MitsubaRun))
-        most = max(1000, min(_MOST_PATHS // power, settings.most_receivers))
-        tracers[family] = (tracer, power, most)
-        peers[family] = {"paths": paths, "traced_paths": power}
-        for n in {n for n in measured if n <= most} | {most}:
+        tracers[family] = tracer
+        for n in {n for n in measured if n <= tracer.most} | {tracer.most}:
             pick = rng.integers(0, len(scene.position), n)
             x, normal = scene.position[pick], scene.normal[pick]
-            calls[f"{family} {n}"] = lambda tracer=tracer, x=x, normal=normal: tracer.predict(x, normal)
-            if isinstance(tracer, MitsubaRun) and scene.component == "bounce1" and n in GRADIENT_COUNTS:
-                calls[f"replay {n}"] = lambda tracer=tracer, x=x, normal=normal: tracer.both(x, normal)
+            calls[f"{family} {n}"] = lambda tracer=tracer, x=x, normal=normal: tracer.run.predict(x, normal)
+            if isinstance(tracer.run, MitsubaRun) and scene.component == "bounce1" and n in GRADIENT_COUNTS:
+                calls[f"replay {n}"] = lambda run=tracer.run, x=x, normal=normal: run.both(x, normal)
     times = interleaved(calls, max(3, settings.repeats // 2), patience=settings.patience)
     solve, lights = times["solve"].median, times["lights"].median
 
@@ -128,10 +105,10 @@ def measure_break_even(
         "lights move": [solve + lights + t for t in lookups],
         "all anew": [solve + lights + t + rest for t, rest in zip(lookups, once, strict=True)],
     }
-    for family, (_, power, most) in tracers.items():
-        peer = peers[family]
-        ratio = peer["paths"] / power
-        peer["seconds"] = [ratio * scaled(n, family, most) for n in counts]
+    peers: dict[str, dict[str, Any]] = {}
+    for family, tracer in tracers.items():
+        peer = peers[family] = {"paths": tracer.paths, "traced_paths": tracer.power}
+        peer["seconds"] = [tracer.ratio * scaled(n, family, tracer.most) for n in counts]
         peer["break_even"] = {what: crossing(counts, t, peer["seconds"]) for what, t in ours.items()}
         at = counts.index(1_000_000)
         peer["speedup_at_million"] = {what: peer["seconds"][at] / t[at] for what, t in ours.items()}
@@ -139,7 +116,7 @@ def measure_break_even(
     replayed = [n for n in GRADIENT_COUNTS if f"replay {n}" in times]
     for n in GRADIENT_COUNTS if replayed else ():
         if f"both {n}" in times:
-            ratio = peers["Mitsuba 3"]["paths"] / peers["Mitsuba 3"]["traced_paths"]
+            ratio = tracers["Mitsuba 3"].ratio
             known = n if n in replayed else replayed[-1]
             replay = ratio * times[f"replay {known}"].median * n / known
             gradients.append({"receivers": n, "ours": times[f"both {n}"].median, "path_replay": replay})

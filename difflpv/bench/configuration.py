@@ -79,6 +79,7 @@ def _learned(neighbors: str = "9x26", **options: Any) -> LpvConfig:
 
 
 _TUNED = ("propagation", "occlusion", "sampling_bias")
+_FITTED = ("stencil", "occlusion", "lookup_gains")
 _OPEN: dict[str, Any] = {"occlusion": "none", "lookup": "trilinear", "deposit": "nearest"}
 _FEW: dict[str, Any] = {"surface_samples": 1024, "area_samples": 16}
 
@@ -96,6 +97,7 @@ LADDER: tuple[Configuration, ...] = (
     _volume("learned_4x26", _learned("4x26")),
     _volume("learned_9x26", _learned(), quick=True),
     _volume("learned_16x26", _learned("16x26")),
+    _volume("learned_9x26, fitted", _learned(), learn=_FITTED),
     _volume("learned_9x26, nothing blocks", _learned(**_OPEN)),
     _volume("learned_9x26, geometry volume", _learned(occlusion="exp")),
     _volume("learned_9x26, two cell sizes", _learned(coarsen_after=10)),
@@ -104,6 +106,7 @@ LADDER: tuple[Configuration, ...] = (
     _volume("learned_9x6, 16 cells, 16 steps", _learned("9x6", steps=16), cells=16, **_FEW, quick=True),
     _volume("learned_9x26, 8 cells, 8 steps", _learned(steps=8), cells=8, **_FEW),
     _volume("learned_9x26, 16 cells, 16 steps", _learned(steps=16), cells=16, **_FEW, quick=True),
+    _volume("learned_9x26, 16 cells, 16 steps, fitted", _learned(steps=16), cells=16, learn=_FITTED, **_FEW, quick=True),
     _volume("learned_9x6, few samples", _learned("9x6"), **_FEW),
     _volume("learned_9x26, few samples", _learned(), **_FEW),
     _volume("learned_9x26, 64 cells, two sizes", _learned(coarsen_after=6), cells=64),

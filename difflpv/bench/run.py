@@ -18,9 +18,10 @@ from difflpv.bench.growth import machine_rates, measure_growth, measure_step
 from difflpv.bench.images import bench_view, flip_unavailable
 from difflpv.bench.measure import Point, measure
 from difflpv.bench.mitsuba_peer import unavailable
+from difflpv.bench.payoff import measure_pay_off
 from difflpv.bench.scenes import BUNDLED, BenchScene, bench_scenes
 from difflpv.bench.settings import BenchSettings
-from difflpv.bench.store import Store, points_csv
+from difflpv.bench.store import Store, pay_off_csv, points_csv
 from difflpv.demo.summary import PRESENTATION, code_digest, describe_machine
 from difflpv.io.atomic import write_json, write_text
 
@@ -41,6 +42,7 @@ class BenchResult:
         points: all scenes, in order.
         scenes: by key: noise of the truth, seconds of the truth, cells.
         break_even: one per scene that meets the tolerance.
+        pay_off: rows of ``measure_pay_off``.
         growth: rows of ``measure_growth``.
         step: ``measure_step``; empty where it was not asked for.
         rates: ``machine_rates``.
@@ -53,6 +55,7 @@ class BenchResult:
     points: list[Point] = field(default_factory=list)
     scenes: dict[str, dict[str, Any]] = field(default_factory=dict)
     break_even: list[dict[str, Any]] = field(default_factory=list)
+    pay_off: list[dict[str, Any]] = field(default_factory=list)
     growth: list[dict[str, Any]] = field(default_factory=list)
     step: dict[str, Any] = field(default_factory=dict)
     rates: dict[str, float] = field(default_factory=dict)
@@ -77,7 +80,7 @@ def run_bench(
     break_even: bool = True,
     progress: Callable[[str], object] = print,
 ) -> BenchResult:
-    """Measure, or find what was measured, and write ``points.jsonl``, ``points.csv`` and ``bench.json``.
+    """Measure, or find what was measured, and write ``points.jsonl``, ``points.csv``, ``pay_off.csv`` and ``bench.json``.
 
     Args:
         out: folder for results and truth.
@@ -86,7 +89,7 @@ def run_bench(
         settings: sizes.
         threads: of torch, of Mitsuba, and processes of the path tracer; all processors of this process by default.
         growth: measure how cost grows, and peers of a step.
-        break_even: measure time over receivers.
+        break_even: measure time over receivers, and after how many solves fits pay off.
         progress: told lines of text.
 
     Raises:
@@ -117,6 +120,8 @@ def run_bench(
                         make = partial(measure_break_even, own, scene, sizes, pool=pool)
                         even = _once(store, f"break-even {scene.key}", make, progress)
                         result.break_even += [even] if even else []
+                        paid = partial(_pay_off, own, scene, sizes, pool)
+                        result.pay_off += _once(store, f"pay-off {scene.key}", paid, progress) or []
                 finally:
                     pool.close()
                 if growth and not result.growth:
@@ -127,6 +132,7 @@ def run_bench(
         torch.set_num_threads(kept)
     result.skipped += [why for why in result.step.get("skipped", {}).values()]
     write_text(folder / "points.csv", points_csv(result.points))
+    write_text(folder / "pay_off.csv", pay_off_csv(result.pay_off))
     write_json(folder / "bench.json", result.to_json())
     return result
 
@@ -158,6 +164,13 @@ def _tuning(scene: BenchScene, sizes: BenchSettings, workers: int) -> BenchScene
         spp=max(512, sizes.spp // 4), seed=sizes.seed + 1, workers=workers,
     )  # fmt: skip
     return found[0] if found else None
+
+
+def _pay_off(own: Sequence[Point], scene: BenchScene, sizes: BenchSettings, pool: PathPool) -> list[dict[str, Any]]:
+    if not any("fit" in p.setup_seconds for p in own):
+        return []
+    tuning = _tuning(scene, sizes, pool.workers)
+    return measure_pay_off(own, scene, tuning, sizes, pool=pool) if tuning else []
 
 
 def _one_scene(

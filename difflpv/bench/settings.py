@@ -23,13 +23,14 @@ class BenchSettings:
         patience: a call that has taken so many seconds in all is not repeated any more [s].
         growth_cells: cells along an edge, to see how cost grows.
         most_receivers: largest number of receivers that is measured; larger ones are scaled up.
+        pay_off_receivers: the same where the pay-off of fits is measured.
         quick: a quick run.
     """
 
     seed: int = 0
     receivers: int = 2000
     spp: int = 4096
-    tuning_receivers: int = 1000
+    tuning_receivers: int = 500
     image_width: int = 128
     image_spp: int = 256
     cell_spp: int = 1024
@@ -37,6 +38,7 @@ class BenchSettings:
     patience: float = 6.0
     growth_cells: tuple[int, ...] = (16, 32, 64, 128)
     most_receivers: int = 1_000_000
+    pay_off_receivers: int = 100_000
     quick: bool = False
 
     @classmethod
@@ -44,5 +46,6 @@ class BenchSettings:
         """Under five minutes on two cores: the order of the methods shows, the third digit does not."""
         return replace(
             cls(seed=seed), receivers=600, spp=1024, tuning_receivers=300, image_width=64, image_spp=64,
-            cell_spp=512, repeats=3, patience=0.5, growth_cells=(16, 32, 64), most_receivers=100_000, quick=True,
+            cell_spp=512, repeats=3, patience=0.5, growth_cells=(16, 32, 64), most_receivers=100_000,
+            pay_off_receivers=10_000, quick=True,
         )  # fmt: skip

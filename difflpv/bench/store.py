@@ -13,7 +13,7 @@ from typing import Any
 from difflpv.bench.measure import Point
 from difflpv.io.atomic import write_text
 
-__all__ = ["Store", "points_csv"]
+__all__ = ["Store", "pay_off_csv", "points_csv"]
 
 
 class Store:
@@ -72,4 +72,22 @@ def points_csv(points: Sequence[Point]) -> str:
         cells = [v for t in times for v in ((t.median, t.low, t.high, t.repeats) if t else ("",) * 4)]
         values = ["" if getattr(p, name) is None else getattr(p, name) for name in plain]
         writer.writerow([*values, *cells, *(p.setup_seconds.get(name, "") for name in setup)])
+    return target.getvalue()
+
+
+def pay_off_csv(rows: Sequence[Mapping[str, Any]]) -> str:
+    """One line per fitted configuration and number of receivers; solves are empty where a fit never pays off.
+
+    Args:
+        rows: of ``difflpv.bench.payoff.measure_pay_off``.
+    """
+    target = io.StringIO()
+    plain = ("scene", "configuration", "error", "error_before", "targets_seconds", "fit_seconds", "paths")
+    each = ("solve_seconds", "traced_seconds", "setup_seconds", "solves", "solves_with_setup")
+    writer = csv.writer(target, lineterminator="\n")
+    writer.writerow([*plain, "receivers", *each])
+    for row in rows:
+        for k, count in enumerate(row["counts"]):
+            values = ["" if row[name][k] is None else row[name][k] for name in each]
+            writer.writerow([*(row[name] for name in plain), count, *values])
     return target.getvalue()

@@ -20,7 +20,6 @@ from difflpv.pipeline import Lpv
 __all__ = ["FloorRun", "VolumeRun"]
 
 _TUNING_BUDGET = 30.0  # forward-equivalents
-_TUNING_RECEIVERS = 2  # every so-manieth receiver of the other seed
 
 
 class VolumeRun:
@@ -72,10 +71,9 @@ class VolumeRun:
         return self._traced(self.light)
 
     def _tuned(self, tuning: BenchScene) -> Lpv:
-        rows = slice(None, None, _TUNING_RECEIVERS)
         target = light_target(
-            tuning.scene, None, self.grid, self.config, tuning.component, index=0, position=tuning.position[rows],
-            normal=tuning.normal[rows], irradiance=tuning.truth[rows], weight=tuning.weight[rows], **self._rays,
+            tuning.scene, None, self.grid, self.config, tuning.component, index=0, position=tuning.position,
+            normal=tuning.normal, irradiance=tuning.truth, weight=tuning.weight, **self._rays,
         )  # fmt: skip
         learn = [name for name in self.configuration.learn if name != "occlusion" or self.config.occlusion != "none"]
         return fit(
