@@ -162,8 +162,8 @@ def _break_even(result: BenchResult, folder: str, names: dict[str, str]) -> str:
     if not result.break_even:
         return "No scene was measured where a learned solve meets 0.2."
     lines = [
-        "The learned configuration that meets an error of 0.2 soonest without a fit, against as many paths per receiver as give",
-        "its error. Wanted: at most 20,000 receivers, and ten times as fast at a million.",
+        "The learned configuration that meets an error of 0.2 soonest without a fit, against as many paths per receiver as",
+        "give its error. Wanted: at most 20,000 receivers, and ten times as fast at a million.",
         "",
         "| scene | configuration | error | peer | paths | break-even, power changes | lights move | all anew | at 1 M: power | "
         "move | anew |",
