@@ -180,16 +180,6 @@ def test_mitsuba_agrees_with_the_truth_within_the_noise_of_both(component, tmp_p
     assert bias < 0.01
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(bool(unavailable()), reason="Mitsuba 3 cannot be used here")
-def test_path_replay_gradient_of_light_power_is_irradiance_over_power(tmp_path):
-    scene = bench_scenes("cornell", tmp_path, components=("bounce1",), receivers=200, spp=1024)[0]
-    run = MitsubaRun(Configuration("m", "mitsuba", "Mitsuba 3", samples=256), scene)
-    gradient = run.both()
-    mean = scene.truth.mean(0) / 3  # of the three channels' mean
-    assert gradient == pytest.approx(mean / scene.scene.lights[0].radiance, rel=0.1)
-
-
 def test_ladder_of_a_quick_run_is_part_of_the_whole():
     assert set(chosen(quick=True)) < set(chosen())
 

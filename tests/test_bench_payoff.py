@@ -14,7 +14,7 @@ from difflpv.bench.sections import pay_off_section
 from difflpv.bench.settings import BenchSettings
 from difflpv.bench.store import pay_off_csv
 
-SIZES = BenchSettings(repeats=2, patience=0.01, pay_off_receivers=1000)
+SIZES = BenchSettings(repeats=2, patience=0.01, costly_receivers=1000)
 
 
 @pytest.fixture(scope="module")

@@ -168,8 +168,8 @@ LIBRARY_OWNERS: dict[str, tuple[str, ...]] = {
     "tqdm": ("data_gen", "difflpv.cli", "scripts"),
     "viser": ("difflpv.viewer.page",),
     "flip_evaluator": ("difflpv.bench.images",),
-    "mitsuba": ("difflpv.bench.mitsuba_peer",),
-    "drjit": ("difflpv.bench.mitsuba_peer",),
+    "mitsuba": ("difflpv.bench.mitsuba_gradient", "difflpv.bench.mitsuba_peer"),
+    "drjit": ("difflpv.bench.mitsuba_gradient", "difflpv.bench.mitsuba_peer"),
 }
 
 # What every path-tracing worker and `difflpv --help` import: torch or Warp would cost each of them seconds.

@@ -15,7 +15,6 @@ from data_gen.few_paths import PathPool
 from difflpv.bench.configuration import LADDER
 from difflpv.bench.equal_error import EqualTracer
 from difflpv.bench.measure import Point, prepare
-from difflpv.bench.mitsuba_peer import MitsubaRun
 from difflpv.bench.scenes import BenchScene
 from difflpv.bench.settings import BenchSettings
 from difflpv.bench.timing import interleaved, timed
@@ -25,7 +24,6 @@ __all__ = ["EQUAL_ERROR", "crossing", "measure_break_even"]
 
 EQUAL_ERROR = 0.2
 COUNTS = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000, 10_000_000)
-GRADIENT_COUNTS = (1_000, 10_000, 100_000)
 _CHUNK = 1 << 18
 
 
@@ -75,10 +73,6 @@ def measure_break_even(
     calls: dict[str, Any] = {"solve": run.solve, "lights": run.relight}
     calls |= {f"lookup {n}": lambda part=part: run.lookup(solved, part) for n, part in parts.items()}
     calls[f"lookup {chunk}"] = lambda: run.lookup(solved, seen)
-    for n in GRADIENT_COUNTS:
-        if n in parts or n == chunk:
-            own = parts.get(n, seen)
-            calls[f"both {n}"] = lambda own=own: run.both(own)
     tracers: dict[str, EqualTracer] = {}
     for family in ("path tracer", "Mitsuba 3"):
         tracer = EqualTracer.of(points, family, best.error, scene, most=settings.most_receivers, pool=pool)
@@ -89,8 +83,6 @@ def measure_break_even(
             pick = rng.integers(0, len(scene.position), n)
             x, normal = scene.position[pick], scene.normal[pick]
             calls[f"{family} {n}"] = lambda tracer=tracer, x=x, normal=normal: tracer.run.predict(x, normal)
-            if isinstance(tracer.run, MitsubaRun) and scene.component == "bounce1" and n in GRADIENT_COUNTS:
-                calls[f"replay {n}"] = lambda run=tracer.run, x=x, normal=normal: run.both(x, normal)
     times = interleaved(calls, max(3, settings.repeats // 2), patience=settings.patience)
     solve, lights = times["solve"].median, times["lights"].median
 
@@ -112,16 +104,8 @@ def measure_break_even(
         peer["break_even"] = {what: crossing(counts, t, peer["seconds"]) for what, t in ours.items()}
         at = counts.index(1_000_000)
         peer["speedup_at_million"] = {what: peer["seconds"][at] / t[at] for what, t in ours.items()}
-    gradients: list[dict[str, float]] = []
-    replayed = [n for n in GRADIENT_COUNTS if f"replay {n}" in times]
-    for n in GRADIENT_COUNTS if replayed else ():
-        if f"both {n}" in times:
-            ratio = tracers["Mitsuba 3"].ratio
-            known = n if n in replayed else replayed[-1]
-            replay = ratio * times[f"replay {known}"].median * n / known
-            gradients.append({"receivers": n, "ours": times[f"both {n}"].median, "path_replay": replay})
     return {
         "scene": scene.key, "configuration": best.name, "error": best.error, "counts": list(counts),
-        "measured": measured[-1], "gradients": gradients, "ours": ours, "peers": peers,
+        "measured": measured[-1], "ours": ours, "peers": peers,
         "geometry_seconds": run.setup["geometry"], "sight_seconds_per_receiver": sight / chunk,
     }  # fmt: skip

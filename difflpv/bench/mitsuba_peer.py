@@ -1,4 +1,4 @@
-"""Mitsuba 3's path integrator on the receivers of a bench scene: the only door to that library.
+"""Mitsuba 3's path integrator on the receivers of a bench scene.
 
 Receivers are the pixels of a sensor that sends cosine-distributed rays from each, so that a pixel is irradiance. The path
 integrator then counts the bounces: depth 2 without the light that is seen at once is the first bounce. Direct light is sampled
@@ -27,13 +27,14 @@ from difflpv.bench.configuration import Configuration
 from difflpv.bench.scenes import BenchScene
 from difflpv.scene import AreaLight, DirectionalLight, PointLight, Scene
 
-__all__ = ["MitsubaRun", "unavailable"]
+__all__ = ["FIRST_BOUNCE", "MitsubaRun", "loaded_mitsuba", "unavailable"]
 
 _VARIABLE = "DRJIT_LIBLLVM_PATH"
 _PROBE = (
     "import mitsuba as mi; mi.set_variant('llvm_ad_rgb'); import drjit as dr; "
     "mi.render(mi.load_dict(mi.cornell_box()), spp=1); dr.sync_thread(); print('works')"
 )
+FIRST_BOUNCE: dict[str, Any] = {"max_depth": 2, "rr_depth": 100, "hide_emitters": True}
 _OFFSET = 2e-5  # of the scene's extent: rays start so far off a surface
 _SEED = 2_000_003  # added to that of the truth
 
@@ -67,7 +68,12 @@ def unavailable() -> str:
 
 
 @lru_cache
-def _mitsuba() -> Any:
+def loaded_mitsuba() -> Any:
+    """Mitsuba, its variant set, the receivers' sensor registered.
+
+    Raises:
+        ImportError: it cannot be used here.
+    """
     why = unavailable()
     if why:
         raise ImportError(why)
@@ -101,6 +107,29 @@ def _define_sensor(mi: Any) -> None:
             ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
             return mi.RayDifferential3f(ray), weight
 
+        def sample_direction(self, it: Any, sample: Any, active: Any = True) -> Any:
+            """A receiver seen from a point of a surface, for paths that are built from an edge of a light to both sides.
+
+            Mitsuba asks twice for each point and takes both answers for one, as of a pinhole: the point's own bits choose.
+            """
+            words: list[Any] = [dr.reinterpret_array(mi.UInt32, c) for c in (it.p.x, it.p.y, it.p.z)]
+            bits, _ = mi.sample_tea_32(words[0] ^ (words[2] * mi.UInt32(2654435761)), words[1] ^ words[2], 5)
+            pixels = int(self._size.x * self._size.y)
+            index = mi.UInt32((mi.UInt64(bits) * mi.UInt64(pixels)) >> 32)
+            active &= index < dr.width(self._position)
+            place = dr.gather(mi.Point3f, self._position, index, active)
+            normal = dr.gather(mi.Normal3f, self._normal, index, active)
+            way, found = place - it.p, dr.zeros(mi.DirectionSample3f, dr.width(index))
+            found.p, found.n, found.dist = place, normal, dr.norm(way)
+            found.d = way / found.dist
+            found.uv = mi.Point2f(mi.Float(index % self._size.x) + 0.5, mi.Float(index // self._size.x) + 0.5)
+            found.pdf, found.delta = dr.select(active, mi.Float(1), mi.Float(0)), True
+            weight = dr.maximum(-dr.dot(found.d, normal), 0) / dr.squared_norm(way)
+            return found, mi.Color3f(dr.select(active, weight, 0))
+
+        def sample_wavelengths(self, si: Any, sample: Any, active: Any = True) -> Any:
+            return [], mi.Color3f(1)
+
         def needs_aperture_sample(self) -> bool:
             return True
 
@@ -121,13 +150,11 @@ class MitsubaRun:
         self.configuration, self.bench, self.samples = configuration, bench, configuration.samples
         self.setup: dict[str, float] = {}
         self.lights = 0.0
-        self._mi = _mitsuba()
+        self._mi = loaded_mitsuba()
         low, high = bench.scene.bounds
         self._lift = _OFFSET * float((high - low).max())
         self.scene = build_scene(self._mi, bench.scene)
-        kind = {"type": "path", "max_depth": 2, "rr_depth": 100, "hide_emitters": True}
-        self.integrator = self._mi.load_dict(kind)
-        self.adjoint = self._mi.load_dict({**kind, "type": "prb"})
+        self.integrator = self._mi.load_dict({"type": "path", **FIRST_BOUNCE})
         self._sensors: dict[int, Any] = {}
 
     def solve(self) -> np.ndarray:
@@ -146,27 +173,6 @@ class MitsubaRun:
         sensor = self.sensor(position, normal)
         image = self._mi.render(self.scene, sensor=sensor, integrator=self.integrator, spp=self.samples, seed=own)
         return np.array(image).reshape(-1, 3)[: len(position)].astype(float)
-
-    def both(self, position: np.ndarray | None = None, normal: np.ndarray | None = None) -> np.ndarray:
-        """Gradient of the receivers' mean irradiance with respect to the power of the first light, by path replay."""
-        import drjit as dr
-
-        if self.bench.component == "direct":
-            raise ValueError("both: path replay is measured on the first bounce only")
-        parameters = self._mi.traverse(self.scene)
-        name = next(k for k in parameters.keys() if re.search(r"(radiance|irradiance|intensity)\.value$", k))
-        dr.enable_grad(parameters[name])
-        parameters.update()
-        if position is None or normal is None:
-            position, normal = self.bench.position, self.bench.normal
-        sensor = self.sensor(position, normal)
-        image = self._mi.render(
-            self.scene, parameters, sensor=sensor, integrator=self.adjoint, spp=self.samples, seed=self.bench.seed + _SEED
-        )
-        dr.backward(dr.mean(image, axis=None))
-        gradient = np.array(dr.grad(parameters[name])).ravel()
-        dr.disable_grad(parameters[name])
-        return gradient
 
     def sensor(self, position: np.ndarray, normal: np.ndarray) -> Any:
         """The receivers as a sensor; kept, as building it is no part of a solve."""

@@ -13,7 +13,7 @@ from difflpv.bench.measure import Point
 from difflpv.bench.pareto import front_verdict, pareto_front, volume_solves
 from difflpv.bench.published import published_tables
 from difflpv.bench.run import BenchResult
-from difflpv.bench.sections import pay_off_section
+from difflpv.bench.sections import gradient_section, pay_off_section
 from difflpv.io.atomic import write_bytes, write_text
 from difflpv.report.bench import FAMILY_COLORS, draw_break_even, draw_error_over_time, draw_growth, small_png, svg_text
 
@@ -137,6 +137,8 @@ def write_document(path: Path, result: BenchResult, *, command: str) -> None:
         _verdicts(result),
         "## Break-even",
         _break_even(result, path.stem, names),
+        "## Gradients",
+        gradient_section(result.gradients),
         "## When a fit pays off",
         pay_off_section(result.pay_off),
         "## How cost grows",
@@ -183,20 +185,6 @@ def _break_even(result: BenchResult, folder: str, names: dict[str, str]) -> str:
         lines += ["", f"No learned configuration of this run meets 0.2 without a fit on {', '.join(missed)}."]
     if left := [key for key in rest if key in able]:
         lines += ["", f"Not measured in this run: {', '.join(left)}."]
-    if any(even["gradients"] for even in result.break_even):
-        lines += [
-            "",
-            "Gradients: forward and backward with respect to the lights (ours: power and place; path replay: power), path",
-            "replay with as many paths as make the irradiance as wrong as ours. Ours carry no noise.",
-            "",
-            "| scene | receivers | ours [ms] | path replay [ms] | ratio |",
-            "|---|---|---|---|---|",
-        ]
-        for even in result.break_even:
-            for g in even["gradients"]:
-                ratio = g["path_replay"] / g["ours"]
-                cells = [even["scene"], f"{g['receivers']:,}", _ms(g["ours"]), _ms(g["path_replay"]), f"{ratio:.1f} x"]
-                lines.append("| " + " | ".join(cells) + " |")
     for even in result.break_even:
         lines += ["", f"![time over receivers]({folder}/{names['break-even ' + even['scene']]}.png)"]
     return "\n".join(lines)

@@ -63,7 +63,7 @@ def _row(point: Point, tracer: EqualTracer, scene: BenchScene, tuning: BenchScen
     (configuration,) = chosen([point.name])
     run = prepare(replace(configuration, learn=()), scene)
     assert isinstance(run, VolumeRun)
-    counts = [n for n in PAY_OFF_COUNTS if n <= settings.pay_off_receivers]
+    counts = [n for n in PAY_OFF_COUNTS if n <= settings.costly_receivers]
     rng, solved = np.random.default_rng(scene.seed), run.solve()
     rows = {n: rng.integers(0, len(scene.position), n) for n in {*PAY_OFF_COUNTS, tracer.most}}
     place = run.light.receivers

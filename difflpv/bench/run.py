@@ -14,6 +14,7 @@ import torch
 from data_gen.few_paths import PathPool
 from difflpv.bench.breakeven import measure_break_even
 from difflpv.bench.configuration import Configuration, chosen
+from difflpv.bench.gradients import measure_gradients
 from difflpv.bench.growth import machine_rates, measure_growth, measure_step
 from difflpv.bench.images import bench_view, flip_unavailable
 from difflpv.bench.measure import Point, measure
@@ -42,6 +43,7 @@ class BenchResult:
         points: all scenes, in order.
         scenes: by key: noise of the truth, seconds of the truth, cells.
         break_even: one per scene that meets the tolerance.
+        gradients: rows of ``measure_gradients``.
         pay_off: rows of ``measure_pay_off``.
         growth: rows of ``measure_growth``.
         step: ``measure_step``; empty where it was not asked for.
@@ -55,6 +57,7 @@ class BenchResult:
     points: list[Point] = field(default_factory=list)
     scenes: dict[str, dict[str, Any]] = field(default_factory=dict)
     break_even: list[dict[str, Any]] = field(default_factory=list)
+    gradients: list[dict[str, Any]] = field(default_factory=list)
     pay_off: list[dict[str, Any]] = field(default_factory=list)
     growth: list[dict[str, Any]] = field(default_factory=list)
     step: dict[str, Any] = field(default_factory=dict)
@@ -89,7 +92,7 @@ def run_bench(
         settings: sizes.
         threads: of torch, of Mitsuba, and processes of the path tracer; all processors of this process by default.
         growth: measure how cost grows, and peers of a step.
-        break_even: measure time over receivers, and after how many solves fits pay off.
+        break_even: measure time over receivers, gradients, and after how many solves fits pay off.
         progress: told lines of text.
 
     Raises:
@@ -120,6 +123,8 @@ def run_bench(
                         make = partial(measure_break_even, own, scene, sizes, pool=pool)
                         even = _once(store, f"break-even {scene.key}", make, progress)
                         result.break_even += [even] if even else []
+                        slopes = partial(measure_gradients, own, scene, sizes, pool=pool)
+                        result.gradients += _once(store, f"gradients {scene.key}", slopes, progress) or []
                         paid = partial(_pay_off, own, scene, sizes, pool)
                         result.pay_off += _once(store, f"pay-off {scene.key}", paid, progress) or []
                 finally:

@@ -23,7 +23,9 @@ class BenchSettings:
         patience: a call that has taken so many seconds in all is not repeated any more [s].
         growth_cells: cells along an edge, to see how cost grows.
         most_receivers: largest number of receivers that is measured; larger ones are scaled up.
-        pay_off_receivers: the same where the pay-off of fits is measured.
+        costly_receivers: the same where a receiver costs more: gradients, the pay-off of fits.
+        gradient_samples: paths per receiver of the reference gradient, a power of two.
+        gradient_replicates: gradients by path replay that tell its noise.
         quick: a quick run.
     """
 
@@ -38,7 +40,9 @@ class BenchSettings:
     patience: float = 6.0
     growth_cells: tuple[int, ...] = (16, 32, 64, 128)
     most_receivers: int = 1_000_000
-    pay_off_receivers: int = 100_000
+    costly_receivers: int = 100_000
+    gradient_samples: int = 4096
+    gradient_replicates: int = 32
     quick: bool = False
 
     @classmethod
@@ -47,5 +51,5 @@ class BenchSettings:
         return replace(
             cls(seed=seed), receivers=600, spp=1024, tuning_receivers=300, image_width=64, image_spp=64,
             cell_spp=512, repeats=3, patience=0.5, growth_cells=(16, 32, 64), most_receivers=100_000,
-            pay_off_receivers=10_000, quick=True,
+            costly_receivers=10_000, gradient_samples=1024, gradient_replicates=12, quick=True,
         )  # fmt: skip

@@ -90,14 +90,24 @@ class VolumeRun:
         """Irradiance [n,3] of the receivers, those of the scene if none are given."""
         return self.lpv.read(solved, self.receivers if receivers is None else receivers).numpy()
 
-    def both(self, receivers: Receivers | None = None) -> Mapping[str, torch.Tensor]:
-        """Gradient with respect to intensity and position of every light: of the error, or of other receivers' mean."""
+    def both(self, receivers: Receivers | None = None, weight: np.ndarray | None = None) -> Mapping[str, torch.Tensor]:
+        """Gradient with respect to intensity and position of every light, float32.
+
+        Args:
+            receivers: those of the scene by default.
+            weight: gradient of ``sum(weight * irradiance)``, [n,3]; by default of the error, or of other receivers' mean.
+        """
         count = len(self.bench.scene.lights)
         leaves = {"light_intensity": torch.ones(count, requires_grad=True)}
         if self.config.deposit != "nearest":
             leaves["light_position"] = torch.zeros(count, 3, requires_grad=True)
         irradiance = self.lpv(self.light, self.receivers if receivers is None else receivers, leaves)
-        aim = irradiance.mean() if receivers is not None else relative_l2(irradiance, self._truth, self._weight)
+        if weight is not None:
+            aim = (torch.as_tensor(weight, dtype=irradiance.dtype) * irradiance).sum()
+        elif receivers is not None:
+            aim = irradiance.mean()
+        else:
+            aim = relative_l2(irradiance, self._truth, self._weight)
         found = torch.autograd.grad(aim, list(leaves.values()), allow_unused=True)
         return {n: torch.zeros_like(v) if g is None else g for (n, v), g in zip(leaves.items(), found, strict=True)}
 
