@@ -195,8 +195,10 @@ def measure_gradients(
 
 def _noise(replay: PathReplay, task: GradientTask, replicates: int, seed: int) -> dict[str, tuple[float, float, float]]:
     """Noise of one gradient by path replay at the pilot's samples, its bias and the bias's standard error; all relative."""
-    sizes = {"power_samples": _PILOT, "place_samples": _PILOT, "forward": False}
-    found = [replay.gradient(seed=seed + number, **sizes) for number in range(replicates)]  # type: ignore[arg-type]
+    found = [
+        replay.gradient(power_samples=_PILOT, place_samples=_PILOT, seed=seed + number, forward=False)
+        for number in range(replicates)
+    ]
     result = {}
     for part, name, truth in (("power", "light_intensity", task.power), ("place", "light_position", task.place)):
         own, length = np.stack([f[name] for f in found]), np.linalg.norm(truth)
@@ -230,8 +232,10 @@ def _row(
             wanted = max(1, math.ceil(known_samples * base / n))
             traced = min(wanted, max(1, _MOST // n))
             scale[n, part] = wanted / traced
-            sizes = {"power_samples": 0, "place_samples": 0, f"{part}_samples": traced}
-            calls[f"{part} {n}"] = partial(replays[n].gradient, **sizes, seed=scene.seed + 1)
+            sizes = (traced, 0) if part == "power" else (0, traced)
+            calls[f"{part} {n}"] = partial(
+                replays[n].gradient, power_samples=sizes[0], place_samples=sizes[1], seed=scene.seed + 1
+            )
     times = interleaved(calls, max(2, settings.repeats // 2), patience=settings.patience)
     row: dict[str, Any] = {
         "scene": scene.key, "configuration": name, "counts": list(rows),
