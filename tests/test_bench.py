@@ -102,7 +102,8 @@ def test_table_of_points_has_a_column_for_every_number():
 
 def test_a_run_is_not_repeated_and_writes_what_it_says(tmp_path):
     told = []
-    options = {"scenes": ["diagonal"], "names": NAMES, "settings": TINY, "threads": 1, "growth": False, "break_even": False}
+    options = {"scenes": ["diagonal"], "names": NAMES, "settings": TINY, "threads": 1}
+    options |= {"growth": False, "break_even": False, "scanlines": False}
     first = run_bench(tmp_path, progress=told.append, **options)
     assert any("measuring" in line for line in told)
     told.clear()
@@ -130,6 +131,7 @@ def test_command_writes_tables_charts_and_an_interactive_page(tmp_path, capsys):
     write_document(page, result, command="difflpv bench")
     text = page.read_text()
     assert text.startswith("# Mine\n\nKept.") and "old" not in text
+    assert "speed/line_diagonal_direct_floor.png" in text and (page.parent / "speed" / "line_diagonal_direct_floor.png").is_file()
     assert "GTX 460" in text and "GTX 480" in text and "speed/diagonal_direct.png" in text
     assert (out / "charts" / "diagonal_direct.svg").read_text().lstrip().startswith("<?xml")
     html = (out / "charts" / "bench.html").read_text()

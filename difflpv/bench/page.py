@@ -15,7 +15,15 @@ from difflpv.bench.published import published_tables
 from difflpv.bench.run import BenchResult
 from difflpv.bench.sections import gradient_section, pay_off_section
 from difflpv.io.atomic import write_bytes, write_text
-from difflpv.report.bench import FAMILY_COLORS, draw_break_even, draw_error_over_time, draw_growth, small_png, svg_text
+from difflpv.report.bench import (
+    FAMILY_COLORS,
+    draw_break_even,
+    draw_error_over_time,
+    draw_growth,
+    draw_scanline,
+    small_png,
+    svg_text,
+)  # fmt: skip
 
 __all__ = ["axes_text", "summary_table", "write_charts", "write_document"]
 
@@ -42,6 +50,8 @@ def write_charts(folder: Path, result: BenchResult, *, svg: bool = True) -> dict
         figures[key] = draw_error_over_time(shown, front, title=key, noise=scene["noise"], volumes=volumes)
     for even in result.break_even:
         figures[f"break-even {even['scene']}"] = draw_break_even(even)
+    for row in result.scanlines:
+        figures[f"line {row['scene']} {row['line']}"] = draw_scanline(row)
     if result.growth:
         figures["growth"] = draw_growth(result.growth)
     names = {}
@@ -143,6 +153,8 @@ def write_document(path: Path, result: BenchResult, *, command: str) -> None:
         pay_off_section(result.pay_off),
         "## How cost grows",
         _growth(result, path.stem, names),
+        "## Along a line",
+        _scanlines(result, path.stem, names),
         "## Beside the theses",
         published_tables(result.points, machine),
         "## Every point",
@@ -187,6 +199,25 @@ def _break_even(result: BenchResult, folder: str, names: dict[str, str]) -> str:
         lines += ["", f"Not measured in this run: {', '.join(left)}."]
     for even in result.break_even:
         lines += ["", f"![time over receivers]({folder}/{names['break-even ' + even['scene']]}.png)"]
+    return "\n".join(lines)
+
+
+def _scanlines(result: BenchResult, folder: str, names: dict[str, str]) -> str:
+    if not result.scanlines:
+        return "No line was measured in this run."
+    methods = list(result.scanlines[0]["methods"])
+    lines = [
+        "Relative L2 error of irradiance along each line; methods as published may leave their charts at the top.",
+        "",
+        "| scene | line | " + " | ".join(methods) + " |",
+        "|---|---|" + "---|" * len(methods),
+    ]
+    for row in result.scanlines:
+        errors = [f"{row['errors'][name]:.3f}" for name in methods]
+        lines.append("| " + " | ".join([row["scene"], row["line"], *errors]) + " |")
+    for row in result.scanlines:
+        key = f"line {row['scene']} {row['line']}"
+        lines += ["", f"![{row['scene']}, {row['line']} line]({folder}/{names[key]}.png)"]
     return "\n".join(lines)
 
 

@@ -20,6 +20,7 @@ from difflpv.bench.images import bench_view, flip_unavailable
 from difflpv.bench.measure import Point, measure
 from difflpv.bench.mitsuba_peer import unavailable
 from difflpv.bench.payoff import measure_pay_off
+from difflpv.bench.scanlines import SCANLINES, measure_scanlines
 from difflpv.bench.scenes import BUNDLED, BenchScene, bench_scenes
 from difflpv.bench.settings import BenchSettings
 from difflpv.bench.store import Store, pay_off_csv, points_csv
@@ -45,6 +46,7 @@ class BenchResult:
         break_even: one per scene that meets the tolerance.
         gradients: rows of ``measure_gradients``.
         pay_off: rows of ``measure_pay_off``.
+        scanlines: rows of ``measure_scanlines``.
         growth: rows of ``measure_growth``.
         step: ``measure_step``; empty where it was not asked for.
         rates: ``machine_rates``.
@@ -59,6 +61,7 @@ class BenchResult:
     break_even: list[dict[str, Any]] = field(default_factory=list)
     gradients: list[dict[str, Any]] = field(default_factory=list)
     pay_off: list[dict[str, Any]] = field(default_factory=list)
+    scanlines: list[dict[str, Any]] = field(default_factory=list)
     growth: list[dict[str, Any]] = field(default_factory=list)
     step: dict[str, Any] = field(default_factory=dict)
     rates: dict[str, float] = field(default_factory=dict)
@@ -81,6 +84,7 @@ def run_bench(
     threads: int | None = None,
     growth: bool = True,
     break_even: bool = True,
+    scanlines: bool = True,
     progress: Callable[[str], object] = print,
 ) -> BenchResult:
     """Measure, or find what was measured, and write ``points.jsonl``, ``points.csv``, ``pay_off.csv`` and ``bench.json``.
@@ -93,6 +97,7 @@ def run_bench(
         threads: of torch, of Mitsuba, and processes of the path tracer; all processors of this process by default.
         growth: measure how cost grows, and peers of a step.
         break_even: measure time over receivers, gradients, and after how many solves fits pay off.
+        scanlines: measure irradiance along lines where a scene has some.
         progress: told lines of text.
 
     Raises:
@@ -118,10 +123,13 @@ def run_bench(
                 pool = PathPool(scene.scene, count)  # its processes start with their first work
                 try:
                     _one_scene(scene, rows, sizes, store, result, pool, progress)
+                    if scanlines and scene.key in SCANLINES:
+                        make = partial(measure_scanlines, scene, spp=sizes.spp, cell_spp=sizes.cell_spp, pool=pool)
+                        result.scanlines += _once(store, f"scanlines {scene.key}", make, progress)
                     if break_even and not (sizes.quick and scene.component == "direct"):
                         own = [p for p in result.points if p.scene == scene.key]
-                        make = partial(measure_break_even, own, scene, sizes, pool=pool)
-                        even = _once(store, f"break-even {scene.key}", make, progress)
+                        from_where = partial(measure_break_even, own, scene, sizes, pool=pool)
+                        even = _once(store, f"break-even {scene.key}", from_where, progress)
                         result.break_even += [even] if even else []
                         slopes = partial(measure_gradients, own, scene, sizes, pool=pool)
                         result.gradients += _once(store, f"gradients {scene.key}", slopes, progress) or []

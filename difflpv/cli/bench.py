@@ -34,7 +34,8 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--only", type=name_list, metavar="NAMES", help="configurations, separated by commas (default: all)")
     parser.add_argument("--quick", action="store_true", help="few configurations, small sizes: under five minutes on two cores")
     parser.add_argument("--no-growth", action="store_true", help="do not measure how cost grows")
-    parser.add_argument("--no-break-even", action="store_true", help="do not measure time over receivers")
+    parser.add_argument("--no-break-even", action="store_true", help="do not measure time over receivers, gradients, pay-off")
+    parser.add_argument("--no-lines", action="store_true", help="do not measure irradiance along lines")
     parser.add_argument("--threads", type=positive, metavar="N", help="threads of every method (default: all processors)")
     parser.add_argument(
         "--out", type=Path, default=Path("out/bench"), metavar="DIR", help="folder for results (default: %(default)s)"
@@ -68,7 +69,8 @@ def run(args: argparse.Namespace) -> int:
         names = _names(args.only)
     result = run_bench(
         args.out, scenes=args.scenes or None, names=names, settings=settings, threads=args.threads,
-        growth=not args.no_growth, break_even=not args.no_break_even, progress=tell,
+        growth=not args.no_growth, break_even=not args.no_break_even, scanlines=not args.no_lines,
+        progress=tell,
     )  # fmt: skip
     write_charts(args.out / "charts", result)
     write_document(document, result, command=_command(args))
@@ -103,7 +105,10 @@ def _command(args: argparse.Namespace) -> str:
     """The command that makes the document anew."""
     parts = ["difflpv bench", *args.scenes]
     parts += [f"--only '{','.join(args.only)}'"] if args.only else []
-    flags = (("--quick", args.quick), ("--no-growth", args.no_growth), ("--no-break-even", args.no_break_even))
+    flags = (
+        ("--quick", args.quick), ("--no-growth", args.no_growth), ("--no-break-even", args.no_break_even),
+        ("--no-lines", args.no_lines),
+    )  # fmt: skip
     parts += [flag for flag, given in flags if given]
     parts += [f"--threads {args.threads}"] if args.threads else []
     parts += [f"--seed {args.seed}"] if args.seed else []

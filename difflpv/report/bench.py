@@ -12,7 +12,9 @@ from difflpv.report.style import axes_in_row, new_figure, png_bytes, title_axis
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["FAMILY_COLORS", "draw_break_even", "draw_error_over_time", "draw_growth", "small_png", "svg_text"]
+__all__ = [
+    "FAMILY_COLORS", "draw_break_even", "draw_error_over_time", "draw_growth", "draw_scanline", "small_png", "svg_text",
+]  # fmt: skip
 
 FAMILY_COLORS = {
     "constant": "#777777", "LPV": "#e69f00", "HOLPV": "#d55e00", "learned": "#00795a", "floor": "#333333",
@@ -20,6 +22,7 @@ FAMILY_COLORS = {
 }  # fmt: skip
 _MARKERS = {"LPV": "s", "HOLPV": "D", "learned": "o", "path tracer": "^", "Mitsuba 3": "v"}
 _DPI = 75
+_STEEP = 20  # peak over median of a line that needs a logarithmic axis
 
 
 def draw_error_over_time(
@@ -98,6 +101,39 @@ def draw_growth(rows: Sequence[Mapping[str, Any]]) -> Figure:
         axis.xaxis.set_minor_locator(NullLocator())
         _plain_ticks(axis.yaxis)
         title_axis(axis, f"exponent {row['exponent']:.2f}")
+    return figure
+
+
+def draw_scanline(row: Mapping[str, Any]) -> Figure:
+    """Irradiance along a line: the truth with two standard errors, and predictions by name; logarithmic past a near light."""
+    import numpy as np
+
+    figure = new_figure(7.6, 3.6, dpi=_DPI)
+    axis = axes_in_row(figure, 1)[0]
+    distance, truth = np.array(row["distance"]), np.array(row["truth"])
+    # a gap where an object stands on the line
+    gaps = np.flatnonzero(np.diff(distance) > 1.5 * np.diff(distance).min()) + 1
+    band = 2 * np.array(row["standard_error"])
+    x, low, high, middle = (np.insert(v, gaps, np.nan) for v in (distance, truth - band, truth + band, truth))
+    axis.fill_between(x, low, high, color="#bbbbbb", linewidth=0, label="path traced, 2 standard errors")
+    axis.plot(x, middle, color="black", linewidth=1.6, label="path traced")
+    colors = {"LPV": "#e69f00", "HOLPV": "#d55e00", "learned_9x26": "#00795a", "floor": "#56b4e9"}
+    for name, values in row["methods"].items():
+        family, style = name.split(" ")[0], "--" if name == "floor" else "-"
+        label = f"{'true SH in the cells' if name == 'floor' else name}: error {row['errors'][name]:.2f}"
+        y = np.insert(np.array(values), gaps, np.nan)
+        axis.plot(x, y, style, color=colors[family], linewidth=1.3, label=label)
+    axis.set(xlabel="distance along the line [m]", ylabel="irradiance [W/m²]", xlim=(distance.min(), distance.max()))
+    if truth.max() > _STEEP * np.median(truth):
+        lit = truth[truth > 0]
+        axis.set(yscale="log", ylim=(0.3 * float(lit.min()), 3 * float(truth.max())))
+        _plain_ticks(axis.yaxis)
+    else:
+        # what is published may be several times too bright: cut off rather than flatten all others
+        top = max(max(v) for name, v in row["methods"].items() if not name.endswith("published"))
+        axis.set_ylim(0, 1.6 * max(top, float(truth.max())))
+    title_axis(axis, f"{row['scene']}: {row['line']} line")
+    figure.legend(frameon=False, fontsize=8, loc="outside right upper")
     return figure
 
 
