@@ -131,7 +131,8 @@ def test_command_writes_tables_charts_and_an_interactive_page(tmp_path, capsys):
     write_document(page, result, command="difflpv bench")
     text = page.read_text()
     assert text.startswith("# Mine\n\nKept.") and "old" not in text
-    assert "speed/line_diagonal_direct_floor.png" in text and (page.parent / "speed" / "line_diagonal_direct_floor.png").is_file()
+    chart = "speed/line_diagonal_direct_floor.png"
+    assert chart in text and (page.parent / chart).is_file()
     assert "GTX 460" in text and "GTX 480" in text and "speed/diagonal_direct.png" in text
     assert (out / "charts" / "diagonal_direct.svg").read_text().lstrip().startswith("<?xml")
     html = (out / "charts" / "bench.html").read_text()
