@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from data_gen.receivers import draw_receivers
+from difflpv.bench import growth
 from difflpv.bench.configuration import LADDER, Configuration, chosen
 from difflpv.bench.measure import Point, errors, measure, prepare
 from difflpv.bench.scenes import bench_scenes, components_of
@@ -56,6 +57,16 @@ def test_peak_memory_of_what_is_held_at_one_time():
 
     assert peak_bytes(call) == pytest.approx(2 * million, rel=0.05)
     assert peak_bytes(lambda: np.zeros(million)) == pytest.approx(8 * million, rel=0.05)
+
+
+def test_a_solve_without_gradients_holds_three_padded_volumes_and_the_transmittance():
+    cells, fields = 32, 27
+    padded = (cells + 2) ** 3 / cells**3  # a halo of one cell; rows of whole vectors fit 32 cells
+    unit = 4 * fields * cells**3
+    opened, occluded = (peak_bytes(growth._solve(cells, occluded=blocks)) / unit for blocks in (False, True))
+    assert growth._three_buffers(cells) / (fields * cells**3) == pytest.approx(3 * padded, rel=1e-3)
+    assert opened == pytest.approx(3 * padded, rel=0.05)
+    assert occluded - opened == pytest.approx(13 / 27 * padded, rel=0.2)
 
 
 def test_noise_is_the_error_of_a_perfect_prediction():

@@ -13,11 +13,13 @@ from difflpv.bench.settings import BenchSettings
 from difflpv.bench.timing import interleaved, peak_bytes
 from difflpv.config import LpvConfig
 from difflpv.illumination import illuminate
+from difflpv.padded import Layout
 from difflpv.pipeline import Lpv
 from difflpv.propagation import propagate
 from difflpv.scene import AreaLight
 from difflpv.stencil import LinearStencil
 from difflpv.stencil_files import learned_stencil
+from warp_kernels.linear_propagation import cpu_lanes
 
 __all__ = ["exponent", "machine_rates", "measure_growth", "measure_step"]
 
@@ -45,8 +47,9 @@ def _passed(cells: int) -> torch.Tensor:
     return torch.rand(13, cells, cells, cells, generator=torch.Generator().manual_seed(1))
 
 
-def _solve(cells: int, *, channels: int = 3, steps: int = _STEPS) -> Callable[[], torch.Tensor]:
-    volume, passed, stencil = _volume(cells, channels), _passed(cells), learned_stencil(_STENCIL)
+def _solve(cells: int, *, channels: int = 3, steps: int = _STEPS, occluded: bool = True) -> Callable[[], torch.Tensor]:
+    volume, passed = _volume(cells, channels), _passed(cells) if occluded else None
+    stencil = learned_stencil(_STENCIL)
 
     def call() -> torch.Tensor:
         with torch.no_grad():
@@ -58,8 +61,9 @@ def _solve(cells: int, *, channels: int = 3, steps: int = _STEPS) -> Callable[[]
 def measure_growth(bench: BenchScene, settings: BenchSettings) -> list[dict[str, Any]]:
     """Cost against one size at a time: rows of ``what``, ``sizes``, ``seconds`` and the fitted ``exponent``.
 
-    Cells also hold ``volumes``, the peak memory of a solve without gradients in volumes. Propagation runs on random light in
-    every cell, so that nothing is left out as empty.
+    Cells also hold ``volumes``, the peak memory of propagation without gradients in volumes, ``volumes_open``, the same where
+    nothing blocks, and ``volumes_buffers``, what three volumes with their halo of one cell come to. Propagation runs on random
+    light in every cell, so that nothing is left out as empty.
 
     Args:
         bench: whose receivers and lights are multiplied.
@@ -81,8 +85,16 @@ def measure_growth(bench: BenchScene, settings: BenchSettings) -> list[dict[str,
         row["exponent"] = exponent(row["sizes"], seconds)
         if what == "cells":
             row["volumes"] = [peak_bytes(call) / (4 * 3 * 9 * n) for n, call in calls.items()]
+            opened = [(n, _solve(n, occluded=False)) for n in settings.growth_cells]
+            row["volumes_open"] = [peak_bytes(call) / (4 * 3 * 9 * n**3) for n, call in opened]
+            row["volumes_buffers"] = [_three_buffers(n) / (3 * 9 * n**3) for n in settings.growth_cells]
         rows.append(row)
     return rows
+
+
+def _three_buffers(cells: int) -> int:
+    layout = Layout.of(torch.empty(3, 9, cells, cells, cells, device="meta"), cpu_lanes(4))
+    return 3 * layout.length(layout.fields)
 
 
 def _receivers(bench: BenchScene, counts: Sequence[int]) -> dict[int, Callable[[], object]]:
