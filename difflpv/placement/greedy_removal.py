@@ -93,12 +93,11 @@ class _Reader:
     """Irradiance of all probes of the dense set, and the truth at the evaluation points, ready to be compared."""
 
     def __init__(self, task: PlacementTask, radiance: np.ndarray, points: int, seed: int) -> None:
-        assert task.weight is not None
         chosen = np.arange(len(task.points))
         if len(chosen) > points:
             chosen = np.sort(np.random.default_rng(seed).choice(len(chosen), points, replace=False))
         self._points = task.points[chosen]
-        self._weight = task.weight[chosen].numpy()
+        self._weight = task.weights[chosen].numpy()
         self._truth = irradiance_of(task.radiance[chosen].numpy(), DIRECTIONS_26).reshape(len(chosen), -1)
         self._content = irradiance_of(radiance, DIRECTIONS_26).reshape(len(radiance), -1)
 

@@ -4,34 +4,75 @@ from __future__ import annotations
 
 from typing import Literal
 
+import numpy as np
 import torch
 
 from difflpv.placement.task import PlacementTask
-from difflpv.probes.probe_set import DIRECTIONS_26, irradiance_of
+from difflpv.probes.probe_set import DIRECTIONS_26
 from difflpv.probes.rows import Interpolation, Rows
 from difflpv.probes.tetrahedra import TetrahedralInterpolation
+from difflpv.sh import cosine_lobe
 
-__all__ = ["Content", "fitted_content", "reconstruction_error"]
+__all__ = ["Content", "Reconstruction", "fitted_content", "irradiance_coordinates", "reconstruction_error"]
 
 Content = Literal["field", "fitted"]
-_RIDGE = 0.02
+RIDGE = 0.02
+_LOBES = cosine_lobe(DIRECTIONS_26, 2)
+_FACTOR = torch.from_numpy(np.linalg.cholesky(_LOBES.T @ _LOBES))
 
 
-def fitted_content(task: PlacementTask, position: torch.Tensor, rows: Rows, *, ridge: float = _RIDGE) -> torch.Tensor:
+def irradiance_coordinates(radiance: torch.Tensor) -> torch.Tensor:
+    """Radiance SH [m,9,C] in coordinates [m,9,C] whose squares sum to those of irradiance over the 26 normals, exactly."""
+    return torch.einsum("mkc,kj->mjc", radiance, _FACTOR.to(radiance))
+
+
+def fitted_content(task: PlacementTask, position: torch.Tensor, rows: Rows, *, ridge: float = RIDGE) -> torch.Tensor:
     """Radiance SH [n,9,C] W/m2 that reconstructs the task's points best, differentiable in positions and weights.
 
     Least squares over the points with a pull of ``ridge`` (share of the points per probe) toward the field's value, so that a
     probe that few points read keeps it; the content of variable projection (Golub and Pereyra 1973).
     """
     start = task.field(position)
-    assert task.weight is not None
-    weight = task.weight / task.weight.mean()
-    matrix = rows.dense(len(position))
-    weighted = (matrix * weight[:, None]).T
-    normal = weighted @ matrix
-    damping = ridge * len(task.points) / len(position) * torch.eye(len(position), dtype=normal.dtype)
-    residual = (task.radiance - rows.apply(start)).flatten(1)
-    return start + torch.linalg.solve(normal + damping, weighted @ residual).reshape(start.shape)
+    found = _least_squares(task, rows.dense(len(position)), start.flatten(1), task.radiance.flatten(1), ridge)
+    return found.reshape(start.shape)
+
+
+class Reconstruction:
+    """The training error of probes at one task's points, as often as it is asked for.
+
+    Attributes:
+        task: points and their truth.
+        content: what probes hold: the "field" where they are, or "fitted" (``fitted_content``).
+        truth: radiance at the points in ``irradiance_coordinates`` [m,9C].
+    """
+
+    def __init__(self, task: PlacementTask, content: Content = "field", *, ridge: float = RIDGE) -> None:
+        """Take the truth.
+
+        Raises:
+            ValueError: an unknown content, or a negative ridge.
+        """
+        if content not in ("field", "fitted"):
+            raise ValueError(f"content: expected field or fitted, got {content!r}")
+        if not ridge >= 0:
+            raise ValueError(f"ridge: expected a number >= 0, got {ridge}")
+        self.task, self.content = task, content
+        self._ridge = ridge
+        self.truth = irradiance_coordinates(task.radiance).flatten(1)
+        self._scale = float((task.weights[:, None] * self.truth.square()).sum().sqrt())
+
+    def read(self, position: torch.Tensor, rows: Rows) -> tuple[torch.Tensor, torch.Tensor]:
+        """What probes at ``position`` [n,3] m hold [n,9C] and what the points read by ``rows`` [m,9C], as ``truth``."""
+        held = irradiance_coordinates(self.task.field(position)).flatten(1)
+        matrix = rows.dense(len(position))  # for as many channels as several lights have, cheaper than the rows' gather
+        if self.content == "fitted":
+            held = _least_squares(self.task, matrix, held, self.truth, self._ridge)
+        return held, matrix @ held
+
+    def error(self, position: torch.Tensor, rows: Rows) -> torch.Tensor:
+        """Relative L2 error of irradiance over 26 normals at the task's points, a scalar."""
+        square = (self.read(position, rows)[1] - self.truth).square().sum(1)
+        return (self.task.weights * square).sum().sqrt() / self._scale
 
 
 def reconstruction_error(
@@ -40,7 +81,7 @@ def reconstruction_error(
     *,
     content: Content = "field",
     interpolation: Interpolation | None = None,
-    ridge: float = _RIDGE,
+    ridge: float = RIDGE,
 ) -> torch.Tensor:
     """Relative L2 error of irradiance over 26 normals at the task's points, a scalar, differentiable in ``position``.
 
@@ -54,12 +95,13 @@ def reconstruction_error(
     Raises:
         ValueError: an unknown content.
     """
-    if content not in ("field", "fitted"):
-        raise ValueError(f"content: expected field or fitted, got {content!r}")
     reader = interpolation or TetrahedralInterpolation(position.detach())
-    rows = reader.rows(position, task.points)
-    held = task.field(position) if content == "field" else fitted_content(task, position, rows, ridge=ridge)
-    found, truth = (irradiance_of(radiance, DIRECTIONS_26) for radiance in (rows.apply(held), task.radiance))
-    assert task.weight is not None
-    weight = task.weight[:, None, None]
-    return ((weight * (found - truth) ** 2).sum() / (weight * truth**2).sum()).sqrt()
+    return Reconstruction(task, content, ridge=ridge).error(position, reader.rows(position, task.points))
+
+
+def _least_squares(
+    task: PlacementTask, matrix: torch.Tensor, start: torch.Tensor, truth: torch.Tensor, ridge: float
+) -> torch.Tensor:
+    weighted = (matrix * (task.weights / task.weights.mean())[:, None]).T
+    damping = ridge * len(task.points) / len(start) * torch.eye(len(start), dtype=matrix.dtype)
+    return start + torch.linalg.solve(weighted @ matrix + damping, weighted @ (truth - matrix @ start))

@@ -12,6 +12,7 @@ import torch
 
 from difflpv.probes.lattice import LatticeField
 from difflpv.probes.probe_set import COEFFS
+from difflpv.probes.reader import ProbeReader
 from difflpv.raycast import Raycaster
 from difflpv.scene import Scene
 
@@ -54,10 +55,14 @@ class PlacementTask:
             raise ValueError(f"placement field: expected [9,{shape[2]}] at a point, got {list(self.field.values.shape[3:])}")
         if self.clearance.values.ndim != 3:
             raise ValueError(f"placement clearance: expected one number a cell, got {list(self.clearance.values.shape[3:])}")
-        weight = torch.ones(count, dtype=torch.float64) if self.weight is None else self.weight
+        weight = self.weights
         if weight.shape != (count,) or not bool((weight >= 0).all()) or not bool(weight.sum() > 0):
             raise ValueError(f"placement weight: expected {count} numbers >= 0, not all 0, got {list(weight.shape)}")
-        object.__setattr__(self, "weight", weight)
+
+    @cached_property
+    def weights(self) -> torch.Tensor:
+        """``weight``, or ones [m]."""
+        return torch.ones(len(self.points), dtype=torch.float64) if self.weight is None else self.weight
 
     @cached_property
     def raycaster(self) -> Raycaster:
@@ -87,6 +92,7 @@ class Placement:
         evaluations: how often the field (or its gradient, counted as one more) was taken at all probes.
         history: (step, training error, probe count) as the method went on.
         details: of the method: thresholds it chose, probes it dropped, why it stopped.
+        reader: how points are to read them.
     """
 
     method: str
@@ -96,6 +102,7 @@ class Placement:
     evaluations: int = 0
     history: tuple[tuple[int, float, int], ...] = ()
     details: Mapping[str, Any] = field(default_factory=dict)
+    reader: ProbeReader = ProbeReader()
 
     def __len__(self) -> int:
         return len(self.position)

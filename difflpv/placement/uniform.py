@@ -21,6 +21,7 @@ SPREADS = (1.0, 1.1, 1.2, 1.3)
 
 MOVE_LIMIT = 0.45
 _SHAPES = 3  # as many shapes are tried by their training error
+_REFINEMENTS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,15 +56,15 @@ def uniform_grids(
         grids = [_free(task, _grid(low, high, shape, spread), margin) for shape in _shapes(high - low, total)[:_SHAPES]]
         return [grid for grid in grids if 0 < len(grid.position) <= count]
 
-    plain = fitting(count)
-    kept = max((len(grid.position) for grid in plain), default=0)
-    if kept < count:
-        finest = min(int(1.1 * count * count / max(kept, 1)), 4 * count)
-        for total in range(finest, count, -max(1, count // 64)):
-            finer = [grid for grid in fitting(total) if len(grid.position) > kept]
-            if finer:
-                return finer
-    return plain
+    best, kept, total = fitting(count), 0, count
+    for _ in range(_REFINEMENTS):  # as many nodes as leave the right number, if the share in free space stays the same
+        kept = max((len(grid.position) for grid in best), default=0)
+        total = min(max(total + 1, round(total * count / max(kept, 1))), 4 * count)
+        finer = [grid for grid in fitting(total) if len(grid.position) > kept]
+        if kept == count or not finer:
+            break
+        best = finer
+    return best
 
 
 def first_grid(journal: Journal, count: int) -> UniformGrid:
@@ -105,7 +106,8 @@ def _shapes(extent: np.ndarray, count: int) -> list[tuple[int, int, int]]:
             spacing = extent / np.asarray(shape)
             poor = min(shape) < 2 or np.prod(shape) < 0.9 * count
             found.append((poor, spacing.max() / max(spacing.min(), 1e-30) + count / np.prod(shape), shape))
-    return [shape for poor, _, shape in sorted(found) if poor == min(found)[0]]
+    found.sort()
+    return [shape for poor, _, shape in found if poor == found[0][0]]
 
 
 def move_into_free_space(

@@ -16,6 +16,7 @@ _TURN = 0.3  # rad, the largest turn of a directional light
 _SHIFT = 0.12  # of the scene's extent, the largest shift of the others
 _SMALLEST = 0.6  # of a panel's edges, so that one which touches the scene's bounds can move too
 _ATTEMPTS = 20
+_LIFT = 0.05  # of the scene's extent
 
 
 def held_out_lights(scene: Scene, count: int, *, seed: int = 0) -> list[list[dict[str, Any]]]:
@@ -88,19 +89,23 @@ def _shifted(
     points: np.ndarray, raycaster: Raycaster, low: np.ndarray, high: np.ndarray, random: np.random.Generator, *, in_plane: bool
 ) -> np.ndarray:
     """Points [n,3] moved together to where all stay inside the scene's bounds and nothing stands in their way."""
-    reach, center = _SHIFT * float((high - low).max()), points.mean(0)
-    normal = np.cross(points[1] - points[0], points[-1] - points[0]) if in_plane else None
-    for attempt in range(_ATTEMPTS):
-        shift, lift = random.uniform(-reach, reach, 3) * 0.8**attempt, np.zeros(3)
-        size = random.uniform(_SMALLEST, 1)
-        if normal is not None:
-            unit = normal / np.linalg.norm(normal)
-            shift -= unit * (shift @ unit)
-            lift = 4 * raycaster.offset * unit  # off the light's own surface
-        moved = center + size * (points - center) + shift
-        free = not raycaster.blocked(points + lift, moved + lift, shortened=False).any()
-        if free and (moved > low - 1e-6).all() and (moved < high + 1e-6).all():
-            return moved
+    extent, center = float((high - low).max()), points.mean(0)
+    unit = None
+    if in_plane:
+        normal = np.cross(points[1] - points[0], points[-1] - points[0])
+        unit = normal / np.linalg.norm(normal)
+    # off the light's own surface; where it is set into a frame, off that too
+    for lift in (4 * raycaster.offset, _LIFT * extent) if in_plane else (0.0,):
+        for attempt in range(_ATTEMPTS):
+            shift = random.uniform(-_SHIFT * extent, _SHIFT * extent, 3) * 0.8**attempt
+            size = random.uniform(_SMALLEST, 1)
+            if unit is not None:
+                shift -= unit * (shift @ unit)
+            moved = center + size * (points - center) + shift
+            above = np.zeros(3) if unit is None else lift * unit
+            free = not raycaster.blocked(points + above, moved + above, shortened=False).any()
+            if free and (moved > low - 1e-6).all() and (moved < high + 1e-6).all():
+                return moved
     return points
 
 

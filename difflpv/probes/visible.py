@@ -20,6 +20,8 @@ too, the planes being held; finer occluders than the map's step (11 degrees for 
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import torch
 
@@ -76,8 +78,13 @@ class VisibleInterpolation:
         normal = scene.triangle_normals
         through = (normal * scene.triangle_vertices[:, 0]).sum(1)
         self._normal, self._through = torch.from_numpy(normal), torch.from_numpy(through)
-        self._receivers = np.empty((0, 3))
-        self._seen = np.empty((0, resolution**2), np.int32)
+        self._memory = _Memory()
+
+    def around(self, inner: Interpolation) -> VisibleInterpolation:
+        """The same eyes over another interpolation; what receivers saw is shared by both."""
+        other = copy.copy(self)
+        other._inner = inner
+        return other
 
     def rows(self, position: torch.Tensor, points: torch.Tensor) -> Rows:
         """Weights of ``points`` [m,3] m, off every surface, over probes at ``position`` [n,3] m; differentiable in both.
@@ -121,16 +128,26 @@ class VisibleInterpolation:
 
     def _look(self, points: np.ndarray, tap: np.ndarray) -> np.ndarray:
         """Triangle [m,k,4] that each point sees along each texel's direction, -1 for none; traced once for each place."""
-        if not np.array_equal(points, self._receivers):
-            self._receivers = points.copy()
-            self._seen = np.full((len(points), self._resolution**2), _UNKNOWN, np.int32)
+        memory = self._memory
+        if not np.array_equal(points, memory.receivers):
+            memory.receivers = points.copy()
+            memory.seen = np.full((len(points), self._resolution**2), _UNKNOWN, np.int32)
+        seen = memory.seen
         receiver = np.broadcast_to(np.arange(len(points))[:, None, None], tap.shape)
-        wanted = np.zeros(self._seen.shape, bool)
+        wanted = np.zeros(seen.shape, bool)
         wanted[receiver, tap] = True
-        row, texel = np.nonzero(wanted & (self._seen == _UNKNOWN))
+        row, texel = np.nonzero(wanted & (seen == _UNKNOWN))
         hits = self._raycaster.closest(points[row], self._direction[texel])
-        self._seen[row, texel] = np.where(hits.valid, hits.triangle, _MISS)
-        return self._seen[receiver, tap].astype(np.int64)
+        seen[row, texel] = np.where(hits.valid, hits.triangle, _MISS)
+        return seen[receiver, tap].astype(np.int64)
+
+
+class _Memory:
+    """What receivers [m,3] saw: the triangle of each texel [m,R*R], or that it is not known yet."""
+
+    def __init__(self) -> None:
+        self.receivers = np.empty((0, 3))
+        self.seen = np.empty((0, 0), np.int32)
 
 
 def _direction_at(uv: np.ndarray) -> np.ndarray:
