@@ -51,7 +51,7 @@ def measure_pay_off(
         ``solves`` that pay targets and fit off, ``solves_with_setup`` that pay the set-up off too (None: never).
     """
     found = [
-        (p, EqualTracer.of(points, "path tracer", p.error, scene, most=max(PAY_OFF_COUNTS), pool=pool))
+        (p, EqualTracer.of(points, "path tracer", p.error, scene, most=settings.costly_receivers, pool=pool))
         for p in points
         if "fit" in p.setup_seconds
     ]

@@ -51,5 +51,5 @@ class BenchSettings:
         return replace(
             cls(seed=seed), receivers=600, spp=1024, tuning_receivers=300, image_width=64, image_spp=64,
             cell_spp=512, repeats=3, patience=0.5, growth_cells=(16, 32, 64), most_receivers=100_000,
-            costly_receivers=10_000, gradient_samples=1024, gradient_replicates=12, quick=True,
+            costly_receivers=10_000, gradient_samples=512, gradient_replicates=8, quick=True,
         )  # fmt: skip
