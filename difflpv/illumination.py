@@ -5,7 +5,7 @@ What moves or scales with a learnable (light power and position, albedo) is appl
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, get_args
 
@@ -121,6 +121,39 @@ class Illumination:
     rsms: tuple[Rsm, ...]
     blocking: tuple[Blocking, ...]
     raycaster: Raycaster
+
+    def on(
+        self,
+        grid: Grid,
+        config: LpvConfig,
+        *,
+        blocking: tuple[Blocking, ...] | None = None,
+        surface_samples: int = 8192,
+        seed: int = 0,
+    ) -> Illumination:
+        """The same lights in other cells or for another solve: what they see, and their VPLs, are not traced again.
+
+        Args:
+            grid: cells of the volume.
+            config: the solve.
+            blocking: as for ``illuminate``; traced if None, with all surfaces as blockers of a geometry volume.
+            surface_samples: as for ``illuminate``.
+            seed: as for ``illuminate``.
+        """
+        like = self.emitters.position
+
+        def surfels() -> tuple[Blockers, bool]:
+            return _surface_blockers(self.scene, surface_samples, seed, like.dtype, like.device), True
+
+        if blocking is None:
+            blocking = tuple(
+                blocking_of(self.scene, level, config, self.raycaster, surfels, dtype=like.dtype, device=like.device)
+                for level in config.grids(grid)
+            )
+        other = replace(self, grid=grid, config=config, blocking=blocking)
+        kept = ["_scene_vpls"] + (["_scene_vpl_cells"] if grid == self.grid else [])
+        other.__dict__.update({name: self.__dict__[name] for name in kept if name in self.__dict__})
+        return other
 
     def _punctual(self) -> torch.Tensor:
         return ~_of_area_lights(self.scene, self.emitters)
@@ -278,10 +311,7 @@ def illuminate(
                 raise ValueError("blockers: 'rsm' needs a point, spot or directional light; use 'surface'")
             joined = (torch.cat([getattr(p, name) for p in parts]) for name in ("position", "normal", "area"))
             return Blockers(*joined), False
-        s = sample_surfaces(
-            scene, surface_samples, seed=seed, dtype=dtype, device=device, both_sides=False, include_lights=True
-        )
-        return Blockers(s.position, s.normal, s.area), True
+        return _surface_blockers(scene, surface_samples, seed, dtype, device), True
 
     if blocking is None:
         blocking = tuple(
@@ -290,6 +320,12 @@ def illuminate(
     if component == "direct":
         rsms = ()
     return Illumination(component, scene, grid, config, emitters, samples, visible, rsms, blocking, raycaster)
+
+
+def _surface_blockers(scene: Scene, count: int, seed: int, dtype: torch.dtype, device: torch.device | str) -> Blockers:
+    """All surfaces by area, each once."""
+    s = sample_surfaces(scene, count, seed=seed, dtype=dtype, device=device, both_sides=False, include_lights=True)
+    return Blockers(s.position, s.normal, s.area)
 
 
 def _check_extent(scene: Scene) -> None:

@@ -8,43 +8,21 @@ import pytest
 from hand_scenes import panel_scene
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from planning_judges import KnownJudge, rungs_of
 
-from difflpv.bench.configuration import Configuration
 from difflpv.cli import main
 from difflpv.config import LpvConfig, grid_for
 from difflpv.config_file import ConfigFileError, read_config_file
 from difflpv.io import load_scene
 from difflpv.lights import apply_light_set
-from difflpv.planning.estimate import ErrorSamples, Estimate
+from difflpv.planning.estimate import ErrorSamples
 from difflpv.planning.explain import explain
-from difflpv.planning.judging import Level
 from difflpv.planning.ladder import PLAN_LADDER, family_of, work_of
 from difflpv.planning.lights import held_out_lights
 from difflpv.planning.plan import make_plan, plan_with
+from difflpv.planning.truth import Level
 
 METHODS = ("learned_4x6", "learned_9x6", "learned_4x26", "learned_9x26")
-
-
-class KnownJudge:
-    """Rungs of known error and cost; each level's bounds are wider than the next one's, and always right."""
-
-    slack = (1.2, 1.0, 1.0)
-
-    def __init__(self, errors, seconds):
-        self.errors, self.times, self.judged = errors, seconds, []
-
-    def work(self, rung):
-        return 1e9 * self.times[rung.name]
-
-    def judge(self, rung, level):
-        self.judged.append((rung.name, level))
-        error, width = self.errors[rung.name], (0.2, 0.05, 0.0)[level]
-        return Estimate(error, error * (1 - width), error * (1 + width)), self.times[rung.name]
-
-
-def rungs_of(count):
-    """Rungs that say nothing about one another: each a family of its own."""
-    return [Configuration(f"rung {i}", "volume", "learned", LpvConfig(steps=i + 1, l_max=2), cells=None) for i in range(count)]
 
 
 numbers = st.floats(0.01, 2.0)
@@ -95,16 +73,6 @@ def test_only_what_is_near_the_answer_is_judged_closely():
     assert "tolerance 0.5 is met by rung 13" in text
     assert "left out, dearer than what was chosen: rung 14; " in text
     assert "half the tolerance, 0.25: dearer rungs were not judged" in text
-
-
-def test_finer_cells_are_not_tried_where_coarser_ones_say_that_they_cannot():
-    rungs = [Configuration(f"{n}", "volume", "learned", LpvConfig(method="learned_9x26"), cells=n) for n in (8, 16, 32, 64)]
-    judge = KnownJudge({"8": 0.9, "16": 0.7, "32": 0.4, "64": 0.01}, {"8": 1, "16": 8, "32": 64, "64": 512})
-    plan = plan_with(judge, rungs, tolerance=0.05)
-    assert plan.chosen is None
-    assert [r.state for r in plan.runners] == ["out", "hopeless", "hopeless", "hopeless"]
-    assert plan_with(judge, rungs, tolerance=0.2).chosen.rung.name == "64"  # 0.9 to 0.4 in two doublings: it might do
-    assert "is not met by anything on the ladder; best found 8: error 0.900" in explain(plan)
 
 
 def test_an_interruption_keeps_what_is_known():
@@ -177,7 +145,7 @@ def test_held_out_lights_are_other_lights_in_free_space(name):
 @pytest.mark.slow
 def test_a_small_scene_from_end_to_end(tmp_path):
     rungs = [r for r in PLAN_LADDER if r.kind == "constant" or (r.cells == 8 and r.config.occlusion == "traced")]
-    levels = (Level(60, 32, 1, 0, 1.2), Level(150, 32, 2, 1))
+    levels = (Level(60, 32, 1, 1.2), Level(150, 32, 2))
     plan = make_plan(panel_scene(floor=2.0), tmp_path, tolerance=0.5, component="direct", rungs=rungs, levels=levels)
     assert plan.best is not None
     plan.save(tmp_path / "plan.json")

@@ -17,6 +17,7 @@ from difflpv.evaluate import relative_noise
 from difflpv.grid import Grid
 from difflpv.illumination import Component
 from difflpv.io import load_scene
+from difflpv.io.tables import ReceiverTable
 from difflpv.leakage import dark_receivers
 from difflpv.lights import apply_light_set
 from difflpv.scene import AreaLight, Scene
@@ -97,7 +98,7 @@ def targets_in_grid(
     folder: str | Path,
     *,
     components: Sequence[Component],
-    receivers: int,
+    receivers: int | ReceiverTable,
     spp: int,
     light_sets: Sequence[Sequence[Mapping[str, Any]]] | None = None,
     seed: int = 0,
@@ -109,15 +110,17 @@ def targets_in_grid(
         scene: with a grid of its own or the default one.
         folder: made if missing; targets of another request in it are replaced.
         components: as for ``data_gen.targets.make_targets``.
-        receivers: how many.
+        receivers: how many, or those drawn before.
         spp: paths per receiver.
         light_sets: for ``difflpv.lights.apply_light_set``; None for the scene's own lights.
         seed: of receivers and paths.
         workers: processes of the path tracer.
     """
+    if isinstance(receivers, int):
+        receivers = draw_receivers(scene, receivers, seed, within=grid_for(scene))
     return make_targets(
-        scene, folder, receivers=draw_receivers(scene, receivers, seed, within=grid_for(scene)), components=components,
-        spp=spp, light_sets=light_sets, seed=seed, workers=workers, overwrite=True, progress=False,
+        scene, folder, receivers=receivers, components=components, spp=spp, light_sets=light_sets, seed=seed, workers=workers,
+        overwrite=True, progress=False,
     )  # fmt: skip
 
 

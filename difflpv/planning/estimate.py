@@ -12,6 +12,7 @@ its cases), so they hold the scatter of the truth's noise too; they say nothing 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -65,10 +66,15 @@ class ErrorSamples:
         """The error and its bounds, each one-sided with ``confidence``."""
         if not 0.5 <= confidence < 1:
             raise ValueError(f"confidence: expected a number in [0.5, 1), got {confidence}")
-        count = self.squared.shape[1]
-        draws = np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), size=_RESAMPLES).astype(float)
+        draws = _draws(self.squared.shape[1], seed)
         power = np.maximum(draws @ self.power.T, 1e-300)
         spread = np.sqrt(np.maximum((draws @ self.squared.T / power).mean(1), 0))
         error = float(np.sqrt(max(0.0, float((self.squared.sum(1) / np.maximum(self.power.sum(1), 1e-300)).mean()))))
         low, high = np.quantile(spread, [1 - confidence, confidence])
         return Estimate(error, min(error, float(low)), max(error, float(high)))
+
+
+@lru_cache(maxsize=4)
+def _draws(count: int, seed: int) -> np.ndarray:
+    """How often each of ``count`` receivers is drawn in each resample, [resamples, count]."""
+    return np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), size=_RESAMPLES).astype(float)

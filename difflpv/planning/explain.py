@@ -13,7 +13,8 @@ _STATES = {
     "out": "error surely too large",
     "unsure": "not surely within the tolerance",
     "dear": "over the budget",
-    "hopeless": "coarser cells of its kind say that it cannot",
+    "hopeless": "coarser cells of its kind foretell that it cannot",
+    "met": "within the tolerance, but dearer than what was chosen",
     "open": "dearer than what was chosen",
 }
 

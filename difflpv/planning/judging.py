@@ -1,14 +1,14 @@
 """Judges rungs on a scene: path-traced truth at held-out receivers under held-out lights, a level at a time.
 
-Each level draws receivers of its own, so that the last one judges a choice by points that had no part in making it. What
-rays decide (what stands between cells, what receivers see) is kept for rungs that share it.
+What rungs or levels share is computed once: what rays decide (what stands between cells, what lights and receivers see), and
+each rung's solve under a light, which a later level reads at more receivers.
 """
 
 from __future__ import annotations
 
 import time
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,52 +16,23 @@ import numpy as np
 import torch
 
 from difflpv.bench.configuration import Configuration
-from difflpv.bench.scenes import targets_in_grid
 from difflpv.blocking import Blocking
-from difflpv.config import grid_for
+from difflpv.config import LpvConfig, grid_for
 from difflpv.evaluate import predict_constant
 from difflpv.grid import Grid
 from difflpv.illumination import Component, Illumination, Receivers, illuminate
-from difflpv.lights import apply_light_set
 from difflpv.pipeline import Lpv
 from difflpv.planning.estimate import ErrorSamples, Estimate
 from difflpv.planning.ladder import work_of
+from difflpv.planning.truth import LEVELS, HeldOutTruth, Level, LevelTruth
 from difflpv.scene import Scene
 from difflpv.stencil import LinearStencil
 
-__all__ = ["LEVELS", "Level", "SceneJudge"]
+__all__ = ["SceneJudge"]
 
-
-@dataclass(frozen=True)
-class Level:
-    """How closely rungs are judged.
-
-    Attributes:
-        receivers: how many.
-        spp: paths per receiver of the truth.
-        lights: light sets, the first of all.
-        repeats: of the timed solve, besides one for every light.
-        slack: see ``difflpv.planning.race.Judge``.
-    """
-
-    receivers: int
-    spp: int
-    lights: int
-    repeats: int
-    slack: float = 1.0
-
-
-LEVELS = (Level(400, 64, 2, 0, 1.2), Level(1200, 64, 4, 2), Level(4000, 128, 4, 5))
-
-
-@dataclass(frozen=True, eq=False)
-class _Truth:
-    position: np.ndarray
-    normal: np.ndarray
-    lit: list[Scene]
-    irradiance: np.ndarray
-    standard_error: np.ndarray
-    weight: np.ndarray
+_REPEATS = 5  # of a solve whose time is asked for
+_SHORT = 0.02  # s: what is shorter is timed twice
+_KEPT = 256 * 2**20  # bytes of solved volumes
 
 
 class SceneJudge:
@@ -70,7 +41,6 @@ class SceneJudge:
     Attributes:
         slack: of each level.
         spent: seconds so far, by "truth" and "rungs".
-        samples: of the last rung judged.
     """
 
     def __init__(
@@ -85,16 +55,22 @@ class SceneJudge:
         seed: int = 0,
         workers: int = 1,
     ) -> None:
-        """Set up; truth is traced level by level when it is first needed, into ``folder``."""
-        self.scene, self.component, self.light_sets = scene, component, list(light_sets)
-        self.folder, self.levels, self.confidence = Path(folder), tuple(levels), confidence
-        self.seed, self.workers = seed, workers
+        """Set up; truth is traced level by level when it is first needed, into ``folder``.
+
+        Raises:
+            ValueError: a level with fewer receivers or lights than the one before.
+        """
+        self.scene, self.component, self.confidence, self.seed = scene, component, confidence, seed
+        self.truth = HeldOutTruth(scene, component, light_sets, folder, levels=levels, seed=seed, workers=workers)
         self.slack: Sequence[float] = [level.slack for level in levels]
         self.spent = {"truth": 0.0, "rungs": 0.0}
-        self._truth: dict[int, _Truth] = {}
+        self._levels: dict[int, LevelTruth] = {}
         self._blocking: dict[Any, tuple[Blocking, ...]] = {}
-        self._lit: dict[str, Illumination] = {}
+        self._lights: dict[tuple[int, Grid | None], Illumination] = {}
         self._receivers: dict[Any, Receivers] = {}
+        self._solved: OrderedDict[tuple[str, int], tuple[torch.Tensor, ...]] = OrderedDict()
+        self._seconds: dict[str, float] = {}
+        self._warm: set[tuple[Any, ...]] = set()
 
     def grid(self, rung: Configuration) -> Grid:
         """The cells of a rung."""
@@ -105,7 +81,7 @@ class SceneJudge:
         return work_of(rung, self.grid(rung))
 
     def judge(self, rung: Configuration, level: int) -> tuple[Estimate, float]:
-        """Error over the level's receivers and lights, and the time of a solve [s], the least of several.
+        """Error over the level's receivers and lights, and the time of a solve [s], the least so far.
 
         Raises:
             ValueError: a kind of rung that this judge cannot measure, or a scene whose component is dark.
@@ -114,80 +90,92 @@ class SceneJudge:
         begin = time.perf_counter()
         if rung.kind == "constant":
             pairs = zip(truth.irradiance, truth.weight, strict=True)
-            found, seconds = np.stack([predict_constant(t, w) for t, w in pairs]), 0.0
-        elif rung.kind == "volume":
-            found, seconds = self._solve(rung, level, truth)
+            found = np.stack([predict_constant(t, w) for t, w in pairs])
+        elif rung.config is not None and rung.kind == "volume":
+            found = np.stack([self._predicted(rung, rung.config, truth, number) for number in truth.sets])
         else:
             raise ValueError(f"rung '{rung.name}': no way to judge kind '{rung.kind}'")
         samples = ErrorSamples.of(found, truth.irradiance, truth.standard_error, truth.weight)
         estimate = samples.estimate(confidence=self.confidence, seed=self.seed)
         self.spent["rungs"] += time.perf_counter() - begin
-        return estimate, seconds
+        return estimate, self._seconds.get(rung.name, 0.0)
 
     @torch.no_grad()
-    def _solve(self, rung: Configuration, level: int, truth: _Truth) -> tuple[np.ndarray, float]:
-        assert rung.config is not None
-        grid, found, seconds = self.grid(rung), [], []
-        lpv = Lpv(grid, rung.config)
+    def retime(self, rung: Configuration) -> float:
+        """Seconds of one solve (inject, propagate), the least of all and of several more; 0 for what solves nothing."""
+        begin = time.perf_counter()
+        if rung.config is not None:
+            number = min(self._levels[min(self._levels)].sets) if self._levels else 0
+            light = self._illuminate(rung.config, self.grid(rung), number)
+            for _ in range(_REPEATS):
+                self._timed(rung, rung.config, light)
+        self.spent["rungs"] += time.perf_counter() - begin
+        return self._seconds.get(rung.name, 0.0)
+
+    @torch.no_grad()
+    def _predicted(self, rung: Configuration, config: LpvConfig, truth: LevelTruth, number: int) -> np.ndarray:
+        grid = self.grid(rung)
+        light = self._illuminate(config, grid, number)
+        key = (rung.name, number)
+        if key not in self._solved:
+            self._solved[key] = self._timed(rung, config, light)
+            kind = (config.method, config.occlusion, config.coarsen_after is None)
+            if self._seconds[rung.name] < _SHORT or kind not in self._warm:  # the first of a kind loads its kernels
+                self._warm.add(kind)
+                self._timed(rung, config, light)
+            while len(self._solved) > 1 and sum(map(_size, self._solved.values())) > _KEPT:
+                self._solved.popitem(last=False)
+        lpv, solved = Lpv(grid, config), self._solved[key]
+        parts = [lpv.gather(solved, light, self._seen(config, grid, light, part, number)) for part in truth.parts]
+        return torch.cat(parts).double().numpy()
+
+    def _timed(self, rung: Configuration, config: LpvConfig, light: Illumination) -> tuple[torch.Tensor, ...]:
         # other processes take from the wall's time, not from ours; of several threads only the wall tells how they overlap
         clock = time.process_time if torch.get_num_threads() == 1 else time.perf_counter
-        for number, lit in enumerate(truth.lit):
-            light = self._illuminate(rung, grid, lit)
-            receivers = self._seen(rung, grid, light, truth, level, number)
-            if rung.config.deposit == "visible":
-                light.vpl_cells(light.vpls())  # rays of a light that has moved, no part of a solve; kept by it
-            for _ in range(1 + (self.levels[level].repeats if number == len(truth.lit) - 1 else 0)):
-                begin = clock()
-                solved = lpv.accumulate(light)
-                seconds.append(clock() - begin)
-            found.append(lpv.gather(solved, light, receivers).double().numpy())
-        return np.stack(found), min(seconds)  # what disturbs can only add
+        lpv, begin = Lpv(light.grid, config), clock()
+        solved = lpv.accumulate(light)
+        self._seconds[rung.name] = min(clock() - begin, self._seconds.get(rung.name, np.inf))  # what disturbs can only add
+        return solved
 
-    def _illuminate(self, rung: Configuration, grid: Grid, lit: Scene) -> Illumination:
-        config = rung.config
-        assert config is not None
-        moved = not np.array_equal(lit.triangle_vertices, self.scene.triangle_vertices)
+    def _illuminate(self, config: LpvConfig, grid: Grid, number: int) -> Illumination:
+        """The scene under a light set; VPLs and the cells that they give to are ready: no part of a solve."""
         stencil = config.stencil
         offsets = stencil.pair_count if isinstance(stencil, LinearStencil) else stencil.name
-        key = (grid, config.occlusion, offsets, len(config.grids(grid)), lit.hash if moved else "")
-        if key in self._blocking and lit.hash in self._lit:  # what the lights see does not depend on the cells
-            return replace(self._lit[lit.hash], grid=grid, config=config, blocking=self._blocking[key])
-        light = illuminate(lit, grid, config, self.component, blocking=self._blocking.get(key), seed=self.seed)
-        self._blocking[key], self._lit[lit.hash] = light.blocking, light
+        key = (grid, config.occlusion, offsets, len(config.grids(grid)), self._geometry(number))
+        known = self._lights.get((number, grid)) or self._lights.get((number, None))
+        if known is None:
+            lit = self.truth.lit(number)
+            light = illuminate(lit, grid, config, self.component, blocking=self._blocking.get(key), seed=self.seed)
+            self._lights[number, None] = light
+        else:
+            light = known.on(grid, config, blocking=self._blocking.get(key), seed=self.seed)
+        self._blocking[key] = light.blocking
+        vpls = light.vpls()
+        if config.deposit == "visible":
+            light.vpl_cells(vpls)
+            self._lights[number, grid] = light
         return light
 
-    def _seen(
-        self, rung: Configuration, grid: Grid, light: Illumination, truth: _Truth, level: int, number: int
-    ) -> Receivers:
-        assert rung.config is not None
-        key = (level, number, grid, rung.config.lookup, len(rung.config.grids(grid)))
+    def _geometry(self, number: int) -> int:
+        """-1 where a light set leaves all surfaces in place, else its number."""
+        moved = not np.array_equal(self.truth.lit(number).triangle_vertices, self.scene.triangle_vertices)
+        return number if moved else -1
+
+    def _seen(self, config: LpvConfig, grid: Grid, light: Illumination, part: int, number: int) -> Receivers:
+        lights = number if self.component == "direct" else self._geometry(number)  # direct: shadow rays to each light
+        key = (part, lights, grid, config.lookup, len(config.grids(grid)))
         if key not in self._receivers:
-            self._receivers[key] = light.receivers(truth.position, truth.normal)
+            table = self.truth.receivers(part)
+            self._receivers[key] = light.receivers(table.position.astype(float), table.normal.astype(float))
         return self._receivers[key]
 
-    def _truth_of(self, level: int) -> _Truth:
-        if level not in self._truth:
+    def _truth_of(self, level: int) -> LevelTruth:
+        if level not in self._levels:
             begin = time.perf_counter()
-            self._truth[level] = self._trace(level)
+            self._levels[level] = self.truth.level(level)
             self.spent["truth"] += time.perf_counter() - begin
-        return self._truth[level]
+        return self._levels[level]
 
-    def _trace(self, level: int) -> _Truth:
-        wanted, sets = self.levels[level], self.light_sets[: self.levels[level].lights]
-        seed = self.seed + 1009 * (level + 1)
-        targets = targets_in_grid(
-            self.scene, self.folder / f"truth_{level}", components=(self.component,), receivers=wanted.receivers,
-            spp=wanted.spp, light_sets=sets, seed=seed, workers=self.workers,
-        )  # fmt: skip
-        irradiance = np.stack([t.irradiance[self.component].astype(float) for t in targets.lights])
-        kept = [i for i in range(len(sets)) if irradiance[i].any()]
-        if not kept:
-            raise ValueError(f"component: scene '{self.scene.name}' has no light in '{self.component}' to plan for")
-        return _Truth(
-            targets.receivers.position.astype(float),
-            targets.receivers.normal.astype(float),
-            [apply_light_set(self.scene, sets[i]) for i in kept],
-            irradiance[kept],
-            np.stack([targets.lights[i].standard_error[self.component].astype(float) for i in kept]),
-            np.stack([targets.lights[i].area_weight.astype(float) for i in kept]),
-        )
+
+def _size(volumes: Sequence[torch.Tensor]) -> int:
+    return sum(v.numel() * v.element_size() for v in volumes)

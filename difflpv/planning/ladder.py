@@ -52,9 +52,15 @@ PLAN_LADDER: tuple[Configuration, ...] = _ladder()
 
 
 def family_of(rung: Configuration) -> tuple[Any, ...]:
-    """What rungs share that differ in their cells only: their error falls with the size of a cell."""
+    """What rungs share that differ in their cells only: their error falls with the size of a cell.
+
+    Two cell sizes are a family of their own: light that goes on in coarse cells is another approximation, which may do better.
+    """
     c = rung.config
-    return (rung.kind,) if c is None else (rung.kind, c.method, c.occlusion, c.lookup, c.steps < min(rung.cells or 32, 32))
+    if c is None:
+        return (rung.kind,)
+    short = c.steps < min(rung.cells or 32, 32)
+    return (rung.kind, c.method, c.occlusion, c.lookup, short, c.coarsen_after is not None)
 
 
 def work_of(rung: Configuration, grid: Grid) -> float:

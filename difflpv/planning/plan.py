@@ -12,10 +12,11 @@ from difflpv.bench.configuration import Configuration
 from difflpv.config import LpvConfig
 from difflpv.illumination import Component
 from difflpv.io.atomic import write_json
-from difflpv.planning.judging import LEVELS, Level, SceneJudge
+from difflpv.planning.judging import SceneJudge
 from difflpv.planning.ladder import PLAN_LADDER
 from difflpv.planning.lights import held_out_lights
 from difflpv.planning.race import Judge, Runner, cheapest, most_accurate
+from difflpv.planning.truth import LEVELS, Level
 from difflpv.scene import Scene
 
 __all__ = ["Plan", "make_plan", "plan_with"]

@@ -1,9 +1,15 @@
 """The race: rungs in the order of their cost, each judged only as closely as it takes to reject it.
 
-``cheapest`` climbs: the cheapest open rung is judged on the next level (more receivers, paths and lights), out once its
-error is surely above the tolerance, chosen once it is surely below it on the last level. So the many rungs below the answer
-cost little each, what lies above it costs nothing, and only the answer and its near misses are judged in full. A rung is
-skipped where coarser cells of its family say that finer ones cannot meet the tolerance (``_Field.hopeless``).
+``cheapest`` climbs: the cheapest open rung is judged on the next level (more lights, then more receivers and paths) until it
+is rejected or, on the last level, surely below the tolerance; what lies above the answer costs nothing. A rung is rejected
+
+- once its error is surely above the tolerance (``Judge.slack`` where a level has fewer lights than the last one);
+- once others that were judged more closely foretell it: rungs see the same receivers and lights, so the ratio of what a later
+  level found to what this one did is much the same for all; the most hopeful ratio seen is taken, and a margin with it;
+- before it is judged, where coarser cells of its family foretell it even if the error fell with the square of their edge, the
+  order at which linear interpolation between cells converges.
+
+All three only reject. What is chosen rests on the bounds of the last level alone.
 
 ``most_accurate`` judges everything within the budget on the first level and halves the field on each further one.
 """
@@ -12,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from difflpv.bench.configuration import Configuration
@@ -24,8 +30,10 @@ __all__ = ["Judge", "Runner", "cheapest", "most_accurate"]
 _TIE = 1.1  # costs closer than this are told apart by their work
 _FIRST_RATE = 1e-11  # s per product, before anything is measured
 _ABOVE_BASE = 3.0  # times the cheapest solve: what takes so long tells the rate of the work
-_ROUGH = 1.25  # times the budget: a time of two or three runs may be so far off
+_ROUGH = 1.25  # a time of one or two runs may be so far off
 _PREDICTION = 1.5  # a rung predicted to be so many times over the budget is not measured
+_MARGIN = 1.1  # between the ratios of errors on two levels of different rungs
+_ORDER = 2.0  # power of the cells' edge with which an error falls at best
 
 
 class Judge(Protocol):
@@ -42,7 +50,10 @@ class Judge(Protocol):
         """Products of one solve."""
 
     def judge(self, rung: Configuration, level: int) -> tuple[Estimate, float]:
-        """Error on this level, and seconds of one solve."""
+        """Error on this level, and seconds of one solve, roughly: the least of all so far."""
+
+    def retime(self, rung: Configuration) -> float:
+        """Seconds of one solve, the least of several; of a rung that was judged."""
 
 
 @dataclass(eq=False)
@@ -52,19 +63,27 @@ class Runner:
     Attributes:
         rung: what runs.
         work: products of one solve.
-        level: last one judged, -1 before the first.
-        estimate: on that level.
-        seconds: of one solve, as measured there.
-        state: "open", "out" (its error is too large), "unsure" (not surely below the tolerance), "dear", "hopeless" (skipped),
-            or "chosen".
+        estimates: of the levels judged, first to last.
+        seconds: of one solve, as measured.
+        state: "open", "out" (its error is too large), "unsure" (not surely below the tolerance, or foretold not to be), "met"
+            (surely below it), "dear", "hopeless" (skipped), or "chosen".
     """
 
     rung: Configuration
     work: float
-    level: int = -1
-    estimate: Estimate | None = None
+    estimates: list[Estimate] = field(default_factory=list)
     seconds: float | None = None
     state: str = "open"
+
+    @property
+    def level(self) -> int:
+        """Last one judged, -1 before the first."""
+        return len(self.estimates) - 1
+
+    @property
+    def estimate(self) -> Estimate | None:
+        """On that level."""
+        return self.estimates[-1] if self.estimates else None
 
 
 @dataclass(eq=False)
@@ -89,29 +108,40 @@ class _Field:
         return round(math.log(max(self.cost(runner), 1e-9)) / math.log(_TIE)), runner.work
 
     def advance(self, runner: Runner, level: int) -> Estimate:
-        runner.estimate, seconds = self.judge.judge(runner.rung, level)
+        estimate, seconds = self.judge.judge(runner.rung, level)
+        runner.estimates.append(estimate)
         runner.seconds = seconds if runner.seconds is None else min(seconds, runner.seconds)
-        runner.level = level
         self.tell(runner)
-        return runner.estimate
+        return estimate
+
+    def retime(self, runner: Runner) -> None:
+        runner.seconds = min(self.judge.retime(runner.rung), self.cost(runner) or math.inf) if runner.work else 0.0
+
+    def lost(self, estimate: Estimate, level: int, tolerance: float) -> str | None:
+        """Why a rung that was so judged on a level is rejected ("out", "unsure"), or None."""
+        if estimate.low > tolerance * self.judge.slack[level]:
+            return "out"
+        last = len(self.judge.slack) - 1
+        for later in range(level + 1, last + 1):
+            known = [r.estimates for r in self.runners if r.level >= later]
+            # the last level asks for an upper bound within the tolerance, one before it hardly goes on with an error above it
+            ratios = [(e[later].high if later == last else e[later].error) / max(e[level].error, 1e-12) for e in known]
+            if ratios and estimate.error * min(ratios) > tolerance * _MARGIN:
+                return "unsure"
+        return None
 
     def hopeless(self, runner: Runner, tolerance: float) -> bool:
-        """True where coarser cells of the same family say that these cannot do it.
-
-        The error is taken to fall as the cells' edge to a power: the one seen between two judged sizes, at its most generous
-        (from the upper bound of one to the lower bound of the other), and at most 1, which is also what one size alone gets.
-        """
+        """True where coarser cells of the same family would be rejected even if their error fell as fast as it can."""
         cells = runner.rung.cells
-        family = [r for r in self.runners if r.estimate and r.rung.cells and family_of(r.rung) == family_of(runner.rung)]
-        coarser = sorted((r for r in family if cells and _cells(r) < cells), key=_cells)
-        if not coarser or not cells:
+        if not cells:
             return False
-        first, last = coarser[0], coarser[-1]
-        power = 1.0
-        if _cells(first) < _cells(last):
-            fall = max(_error(first).high, 1e-12) / max(_error(last).low, 1e-12)
-            power = min(1.0, max(0.0, math.log(fall) / math.log(_cells(last) / _cells(first))))
-        return _error(last).low * (_cells(last) / cells) ** power > tolerance * self.judge.slack[last.level]
+        family = [r for r in self.runners if r.estimates and r.rung.cells and family_of(r.rung) == family_of(runner.rung)]
+        for coarser in family:
+            if _cells(coarser) < cells:
+                fall, e = (_cells(coarser) / cells) ** _ORDER, _error(coarser)
+                if self.lost(Estimate(e.error * fall, e.low * fall, e.high * fall), coarser.level, tolerance):
+                    return True
+        return False
 
 
 def _cells(runner: Runner) -> int:
@@ -145,21 +175,31 @@ def cheapest(
         raise ValueError(f"tolerance: expected a positive number, got {tolerance}")
     race = _Field(_start(rungs, judge, runners), judge, tell)
     last = len(judge.slack) - 1
-    while waiting := [r for r in race.runners if r.state == "open"]:
+    while waiting := [r for r in race.runners if r.state in ("open", "met")]:
         runner = min(waiting, key=race.key)
+        if runner.state == "met":
+            runner.state = "chosen"
+            return runner
         if runner.level < 0 and race.hopeless(runner, tolerance):
             runner.state = "hopeless"
             continue
-        estimate = race.advance(runner, runner.level + 1)
-        if estimate.low > tolerance * judge.slack[runner.level]:
-            runner.state = "out"
-        elif runner.level == last - 1 and judge.slack[runner.level] == 1 and estimate.error > tolerance:
-            runner.state = "unsure"  # more receivers would have to move the error itself, not only its bounds
+        lost = race.lost(runner.estimates[-1], runner.level, tolerance) if runner.estimates else None  # others came later
+        if lost is None:
+            lost = race.lost(race.advance(runner, runner.level + 1), runner.level, tolerance)
+        if lost is None and runner.level == last - 1 and judge.slack[last - 1] == 1:
+            e = _error(runner)
+            if (e.low + e.error) / 2 > tolerance:  # four in five say that the last level's error, too, is above
+                lost = "unsure"
+        if lost is not None:
+            runner.state = lost
         elif runner.level == last:
-            if estimate.high <= tolerance:
-                runner.state = "chosen"
-                return runner
-            runner.state = "unsure"
+            if _error(runner).high > tolerance:
+                runner.state = "unsure"
+                continue
+            runner.state = "met"  # times were rough so far: is it the cheapest?
+            rivals = [r for r in waiting if r.seconds is not None and race.cost(r) <= _ROUGH * race.cost(runner)]
+            for rival in rivals:
+                race.retime(rival)
     return None
 
 
@@ -181,6 +221,8 @@ def most_accurate(
                 runner.state = "dear"
                 continue
             race.advance(runner, level)
+            if level == len(judge.slack) - 1:
+                race.retime(runner)
             if race.cost(runner) > budget * (1 if level == len(judge.slack) - 1 else _ROUGH):
                 runner.state = "dear"
         left = sorted((r for r in race.runners if r.state == "open"), key=lambda r: _error(r).error)
@@ -200,5 +242,4 @@ def most_accurate(
 
 
 def _error(runner: Runner) -> Estimate:
-    assert runner.estimate is not None
-    return runner.estimate
+    return runner.estimates[-1]

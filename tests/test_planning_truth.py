@@ -1,0 +1,112 @@
+"""Truth by levels, and the judge on a small scene: nothing twice, and bounds that hold against many more receivers."""
+
+import numpy as np
+import pytest
+from hand_scenes import panel_scene
+
+from difflpv.config import LpvConfig, grid_for
+from difflpv.illumination import illuminate
+from difflpv.pipeline import Lpv
+from difflpv.planning.judging import SceneJudge
+from difflpv.planning.ladder import PLAN_LADDER
+from difflpv.planning.lights import held_out_lights
+from difflpv.planning.truth import HeldOutTruth, Level
+
+LEVELS = (Level(40, 32, 1, 1.3), Level(40, 32, 2), Level(100, 32, 2))
+SMALL = next(r for r in PLAN_LADDER if r.name == "learned_9x26, 8 cells, 8 steps")
+
+
+def judge_of(tmp_path, **options):
+    scene = panel_scene(floor=2.0)
+    return SceneJudge(scene, "direct", held_out_lights(scene, 2), tmp_path, **{"levels": LEVELS, **options})
+
+
+def test_a_level_adds_lights_and_receivers_to_the_one_before(tmp_path):
+    scene = panel_scene(floor=2.0)
+    truth = HeldOutTruth(scene, "direct", held_out_lights(scene, 2), tmp_path, levels=LEVELS)
+    first, second, third = (truth.level(k) for k in range(3))
+    assert [t.irradiance.shape for t in (first, second, third)] == [(1, 40, 3), (2, 40, 3), (2, 100, 3)]
+    assert np.array_equal(first.irradiance[0], second.irradiance[0])
+    assert np.array_equal(second.irradiance, third.irradiance[:, :40])
+    assert (third.parts, third.sets) == ((0, 2), (0, 1))
+    # the parts together stand for the area of one: each for its share by count
+    assert np.allclose(third.weight[:, :40].sum(1) / third.weight.sum(1), 0.4)
+    assert np.allclose(third.weight.sum(1), second.weight.sum(1))
+    again = HeldOutTruth(scene, "direct", held_out_lights(scene, 2), tmp_path / "again", levels=LEVELS).level(2)
+    assert np.array_equal(again.irradiance, third.irradiance)
+
+
+def test_a_light_set_that_brings_no_light_is_passed_over(tmp_path):
+    scene = panel_scene(floor=2.0)
+    own = held_out_lights(scene, 2)
+    dark = [{**own[0][0], "radiance": [0.0, 0.0, 0.0]}]
+    truth = HeldOutTruth(scene, "direct", [dark, *own], tmp_path, levels=LEVELS)
+    assert truth.level(0).sets == (1,)
+    assert truth.level(1).sets == (1, 2)
+    with pytest.raises(ValueError, match="scene 'panel' has no light in 'direct' to plan for"):
+        HeldOutTruth(scene, "direct", [dark], tmp_path / "dark", levels=LEVELS).level(0)
+
+
+def test_levels_never_become_smaller(tmp_path):
+    with pytest.raises(ValueError, match="levels: expected receivers and lights that never become fewer"):
+        judge_of(tmp_path, levels=(Level(40, 32, 2), Level(30, 32, 2)))
+
+
+def test_each_light_is_solved_once_and_times_are_repeated_on_request(tmp_path, monkeypatch):
+    solves, real = [], Lpv.accumulate
+
+    def counted(self, *args, **kwargs):
+        solves.append(1)
+        return real(self, *args, **kwargs)
+
+    monkeypatch.setattr(Lpv, "accumulate", counted)
+    judge = judge_of(tmp_path)
+    monkeypatch.setattr("difflpv.planning.judging._SHORT", 0.0)
+    counts = []
+    for level in range(3):
+        _, seconds = judge.judge(SMALL, level)
+        counts.append(len(solves))
+    assert counts == [2, 3, 3]  # the first of its kind is solved twice: it loads kernels
+    assert judge.retime(SMALL) <= seconds
+    assert len(solves) == 3 + 5
+    assert judge.retime(PLAN_LADDER[0]) == 0.0
+
+
+def test_the_order_of_judging_changes_no_error(tmp_path):
+    """What is kept between rungs and levels is the same as what would be computed anew."""
+    others = [r for r in PLAN_LADDER if r.cells == 8 or r.name == "learned_9x26, 16 cells, 16 steps, geometry volume"]
+    judge = judge_of(tmp_path)
+    for rung in others:
+        judge.judge(rung, 0)
+    for rung in others:
+        alone, _ = judge_of(tmp_path).judge(rung, 2)
+        assert judge.judge(rung, 2)[0] == alone, rung.name
+
+
+@pytest.mark.parametrize("config", [
+    LpvConfig(method="learned_9x26", steps=6), LpvConfig(method="holpv", occlusion="exp", steps=6),
+])  # fmt: skip
+def test_lights_carried_over_to_other_cells_are_the_same_as_traced_anew(config):
+    scene = panel_scene(floor=2.0)
+    coarse, fine = grid_for(scene, 8), grid_for(scene, 12)
+    position, normal = np.array([[0.1, 0.0, 0.2]]), np.array([[0, 1.0, 0]])
+    first = illuminate(scene, coarse, LpvConfig(method="learned_4x6", steps=6), "direct", seed=3)
+    first.vpl_cells(first.vpls())  # those of the coarse cells must not be carried over
+    for grid in (fine, coarse):
+        anew, carried = illuminate(scene, grid, config, "direct", seed=3), first.on(grid, config, seed=3)
+        found = [Lpv(grid, config)(light, light.receivers(position, normal)) for light in (anew, carried)]
+        assert found[0].abs().max() > 0
+        assert found[0].tolist() == found[1].tolist()
+
+
+@pytest.mark.slow
+def test_bounds_hold_against_the_error_over_many_more_receivers(tmp_path):
+    """Brute force with other receivers, other paths and ten times as many; both bounds with 99.9 %."""
+    levels = (Level(200, 64, 1, 1.3), Level(200, 64, 2), Level(500, 64, 2))
+    judge = judge_of(tmp_path / "few", levels=levels, confidence=0.999)
+    brute = judge_of(tmp_path / "many", levels=(Level(5000, 64, 2),), seed=77)
+    for name in ("constant", SMALL.name, "learned_4x26, 16 cells, 16 steps", "learned_9x26, 16 cells, 16 steps"):
+        rung = next(r for r in PLAN_LADDER if r.name == name)
+        estimate, truth = judge.judge(rung, 2)[0], brute.judge(rung, 0)[0].error
+        assert estimate.low <= truth <= estimate.high, name
+        assert judge.judge(rung, 0)[0].low <= 1.3 * truth, name
