@@ -66,12 +66,13 @@ def test_only_what_is_near_the_answer_is_judged_closely():
     judge = KnownJudge(errors, seconds)
     plan = plan_with(judge, rungs, tolerance=0.5)
     assert plan.chosen.rung.name == "rung 13"  # 0.48
-    assert max(int(name.split()[1]) for name, _ in judge.judged) <= 13
+    # what may turn out to be no dearer is looked at roughly
+    assert {int(name.split()[1]) for name, level in judge.judged if level == 0} == set(range(15))
     assert [name for name, level in judge.judged if level == 2] == ["rung 13"]
     assert all(r.state == "open" for r in plan.runners[14:])
     text = explain(plan)
     assert "tolerance 0.5 is met by rung 13" in text
-    assert "left out, dearer than what was chosen: rung 14; " in text
+    assert "left out, dearer than what was chosen: rung 14 (0.440); rung 15; " in text
     assert "half the tolerance, 0.25: dearer rungs were not judged" in text
 
 

@@ -29,6 +29,8 @@ __all__ = ["Judge", "Runner", "cheapest", "most_accurate"]
 
 _TIE = 1.1  # costs closer than this are told apart by their work
 _FIRST_RATE = 1e-11  # s per product, before anything is measured
+_FINER = 1.5  # times as much work a second may be done in finer cells
+_OTHER_KIND = 2.5  # or by another kind of solve
 _ABOVE_BASE = 3.0  # times the cheapest solve: what takes so long tells the rate of the work
 _ROUGH = 1.25  # a time of one or two runs may be so far off
 _PREDICTION = 1.5  # a rung predicted to be so many times over the budget is not measured
@@ -95,13 +97,19 @@ class _Field:
     tell: Callable[[Runner], object]
 
     def cost(self, runner: Runner) -> float:
-        """Measured, or else what the cheapest measured solve costs besides its work, and the work at the best rate seen."""
+        """Measured, or else the least to be expected: so none comes too late.
+
+        That is what the cheapest measured solve costs besides its work, and the work at the best rate seen, taken to be better
+        still for other cells and another kind of solve.
+        """
         if runner.seconds is not None or not runner.work:
             return runner.seconds or 0.0
-        known = [(r.seconds, r.work) for r in self.runners if r.seconds is not None and r.work]
-        base = min((seconds for seconds, _ in known), default=0.0)
-        rates = [(seconds - base) / work for seconds, work in known if seconds > _ABOVE_BASE * base]
-        return base + runner.work * min(rates, default=_FIRST_RATE)
+        known = [(r, r.seconds) for r in self.runners if r.seconds is not None and r.work]
+        base = min((seconds for _, seconds in known), default=0.0)
+        rates = [(_kind(r), (seconds - base) / r.work) for r, seconds in known if seconds > _ABOVE_BASE * base]
+        own = [rate / _FINER for kind, rate in rates if kind == _kind(runner)]
+        others = [rate / _OTHER_KIND for _, rate in rates]
+        return base + runner.work * min(own or others, default=_FIRST_RATE)
 
     def key(self, runner: Runner) -> tuple[int, float]:
         """Order of the climb: costs within a tie are one."""
@@ -125,8 +133,10 @@ class _Field:
         for later in range(level + 1, last + 1):
             known = [r.estimates for r in self.runners if r.level >= later]
             # the last level asks for an upper bound within the tolerance, one before it hardly goes on with an error above it
-            ratios = [(e[later].high if later == last else e[later].error) / max(e[level].error, 1e-12) for e in known]
-            if ratios and estimate.error * min(ratios) > tolerance * _MARGIN:
+            final = later == last
+            ratios = [(e[later].high if final else e[later].error) / max(e[level].error, 1e-12) for e in known]
+            # how far a bound lies above the error differs more between rungs: two have to agree
+            if len(ratios) >= (2 if final else 1) and estimate.error * min(ratios) > tolerance * _MARGIN:
                 return "unsure"
         return None
 
@@ -142,6 +152,11 @@ class _Field:
                 if self.lost(Estimate(e.error * fall, e.low * fall, e.high * fall), coarser.level, tolerance):
                     return True
         return False
+
+
+def _kind(runner: Runner) -> tuple[str, bool] | None:
+    config = runner.rung.config
+    return None if config is None else (config.method, config.coarsen_after is not None)
 
 
 def _cells(runner: Runner) -> int:
