@@ -45,33 +45,58 @@ def pair_transmittance(
     """
     if rays_per_axis < 1:
         raise ValueError(f"rays_per_axis: expected at least 1, got {rays_per_axis}")
-    near = _near_geometry(triangles, grid)
+    around = _with_margin(grid)
+    near_around = _near_geometry(triangles, around)
+    near = np.ascontiguousarray(near_around[1:-1, 1:-1, 1:-1])
     centers = grid.sight_centers().reshape(-1, 3)
     passed = np.ones((len(offsets), *grid.shape), np.float32)
     axis = (np.arange(rays_per_axis) + 0.5) / rays_per_axis - 0.5
     starts = np.array(list(itertools.product(axis, repeat=3))) * grid.cell_size
+    sees = _seen_from_centers(raycaster, around, near_around, starts)
+    padded = np.arange(sees[0].size).reshape(sees.shape[1:])[1:-1, 1:-1, 1:-1].ravel()  # of each cell, in ``sees``
+    sees = sees.reshape(len(starts), -1)
+    strides = np.array([1, grid.resolution[0] + 2, (grid.resolution[0] + 2) * (grid.resolution[1] + 2)])
     for row, offset in zip(passed, np.asarray(offsets), strict=True):
         where = np.flatnonzero(_any_in_block(near, offset))
         for begin in range(0, len(where), _PAIRS_PER_CHUNK):
             chosen = where[begin : begin + _PAIRS_PER_CHUNK]
-            row.reshape(-1)[chosen] = _share(raycaster, centers[chosen], grid.cell_size * offset, starts)
+            both = sees[:, padded[chosen]] & sees[:, padded[chosen] + int(strides @ offset)]
+            row.reshape(-1)[chosen] = _share(raycaster, centers[chosen], grid.cell_size * offset, starts, both)
     return passed
 
 
-def _share(raycaster: Raycaster, center: np.ndarray, step: np.ndarray, starts: np.ndarray) -> np.ndarray:
-    """Share of free segments between cells at ``center`` [m,3] and ``center + step``, shape [m]."""
+def _with_margin(grid: Grid) -> Grid:
+    """The grid and the cells around it."""
+    (x, y, z), (columns, rows, layers), h = grid.minimum, grid.resolution, grid.cell_size
+    return Grid((x - h, y - h, z - h), h, (columns + 2, rows + 2, layers + 2))
+
+
+def _seen_from_centers(raycaster: Raycaster, grid: Grid, near: np.ndarray, starts: np.ndarray) -> np.ndarray:
+    """Which starts [s,3] m from its centre each cell's centre sees, bool [s, n_z, n_y, n_x]: all, where none is ``near``.
+
+    One ray per cell and start, for all the pairs that the cell is in.
+    """
+    sees = np.ones((len(starts), *grid.shape), bool)
+    if len(starts) > 1:  # the centre sees itself
+        cells = np.flatnonzero(near)
+        center = grid.sight_centers().reshape(-1, 3)[cells]
+        for row, start in zip(sees, starts, strict=True):
+            row.reshape(-1)[cells] = ~raycaster.blocked(center, center + start, shortened=False)
+    return sees
+
+
+def _share(raycaster: Raycaster, center: np.ndarray, step: np.ndarray, starts: np.ndarray, both: np.ndarray) -> np.ndarray:
+    """Share of free segments between cells at ``center`` [m,3] and ``center + step``, shape [m].
+
+    ``both`` [s,m] tells which starts the centres at both ends see: others lie behind a wall that cuts a cell.
+    """
 
     def unblocked(origins: np.ndarray, targets: np.ndarray) -> np.ndarray:
         return ~raycaster.blocked(origins, targets, shortened=False)
 
-    free, counted = np.zeros(len(center)), np.zeros(len(center))
-    straight = len(starts) == 1  # the centre sees itself
-    for start in starts:
-        valid = np.arange(len(center))
-        if not straight:
-            valid = valid[unblocked(center, center + start)]
-            valid = valid[unblocked(center[valid] + step, center[valid] + step + start)]
-        counted[valid] += 1
+    free, counted = np.zeros(len(center)), both.sum(0)
+    for start, seen in zip(starts, both, strict=True):
+        valid = np.flatnonzero(seen)
         free[valid] += unblocked(center[valid] + start, center[valid] + start + step)
     alone = np.flatnonzero(counted == 0)
     free[alone] = unblocked(center[alone], center[alone] + step)

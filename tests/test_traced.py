@@ -147,6 +147,26 @@ def test_solids_and_rooms(tmp_path):
         assert not row[near][inside[near] != inside[far]].any()
 
 
+def test_shares_are_those_of_every_pair_traced_by_itself():
+    """What centres see is traced once for all pairs of a cell, past the grid's edge too; the definition, ray by ray."""
+    scene = box_scene(low=(-0.6, -1.3, -0.55), high=(0.62, 0.51, 1.4))
+    grid, raycaster = Grid((-1.0, -1, -1), 0.5, (4, 3, 4)), Raycaster(scene)
+    passed = pair_transmittance(raycaster, scene.triangle_vertices, grid, PAIRS)
+    starts = np.array(list(itertools.product((-0.125, 0.125), repeat=3)))
+
+    def free(a, b):
+        return not raycaster.blocked(a[None], b[None], shortened=False)[0]
+
+    for row, n in zip(passed, PAIRS, strict=True):
+        for (z, y, x), share in np.ndenumerate(row):
+            here = grid.sight_centers(np.array([x, y, z]))
+            there = here + 0.5 * n
+            usable = [s for s in starts if free(here, here + s) and free(there, there + s)]
+            expected = np.mean([free(here + s, there + s) for s in usable]) if usable else free(here, there)
+            assert share == np.float32(expected), (n, x, y, z)
+    assert 0 < passed.mean() < 1
+
+
 def test_messages():
     with pytest.raises(ValueError, match="rays_per_axis: expected at least 1, got 0"):
         traced(wall(0.0), rays_per_axis=0)
