@@ -106,6 +106,15 @@ def test_one_that_was_judged_closely_saves_the_others_it():
     assert [r.state for r in plan.runners] == ["out"] + 9 * ["unsure"]
 
 
+def test_a_foretelling_leaves_a_margin():
+    """One read 4 % too low on the first level, the other 4 % too high: the second still gets its chance, and meets."""
+    errors, seconds = {"rung 0": 0.25, "rung 1": 0.2}, {"rung 0": 1.0, "rung 1": 2.0}
+    judge = EasierFirst(errors, seconds, 1.0, {"rung 0": 0.96, "rung 1": 1.04})
+    assert plan_with(judge, rungs_of(2), tolerance=0.2).chosen.rung.name == "rung 1"
+    judge = EasierFirst(errors, seconds, 1.0, {"rung 0": 0.96, "rung 1": 1.2})
+    assert plan_with(judge, rungs_of(2), tolerance=0.2).runners[1].state == "unsure"
+
+
 def test_times_are_repeated_for_what_meets_the_tolerance_and_its_rivals_only():
     """A rough time of the cheapest, 1.2 times too long, does not cost it the choice."""
 
@@ -122,9 +131,9 @@ def test_times_are_repeated_for_what_meets_the_tolerance_and_its_rivals_only():
     assert set(judge.timed) <= {"rung 1", "rung 2"}
 
 
-@pytest.mark.parametrize("scale, most", [(1.02, 0.05), (1.3, 0.0)])
+@pytest.mark.parametrize("scale, most", [(1.005, 0.05), (1.3, 0.0)])
 def test_chance_gets_a_bad_rung_chosen_no_oftener_than_the_confidence_says(scale, most):
-    """Real bootstrap bounds, and levels that share receivers: an error of 1.02 and 1.3 tolerances is let through by chance."""
+    """Real bootstrap bounds, and levels that share receivers: an error of 1.005 or 1.3 tolerances may pass by chance."""
     tolerance, trials, chosen = 0.2, 250, 0
     rung = rungs_of(1)
     for trial in range(trials):

@@ -7,6 +7,7 @@ from hand_scenes import panel_scene
 from difflpv.config import LpvConfig, grid_for
 from difflpv.illumination import illuminate
 from difflpv.pipeline import Lpv
+from difflpv.planning.estimate import ErrorSamples
 from difflpv.planning.judging import SceneJudge
 from difflpv.planning.ladder import PLAN_LADDER
 from difflpv.planning.lights import held_out_lights
@@ -72,15 +73,23 @@ def test_each_light_is_solved_once_and_times_are_repeated_on_request(tmp_path, m
     assert judge.retime(PLAN_LADDER[0]) == 0.0
 
 
-def test_the_order_of_judging_changes_no_error(tmp_path):
-    """What is kept between rungs and levels is the same as what would be computed anew."""
-    others = [r for r in PLAN_LADDER if r.cells == 8 or r.name == "learned_9x26, 16 cells, 16 steps, geometry volume"]
+def test_what_is_kept_between_rungs_and_levels_is_what_would_be_computed_anew(tmp_path):
+    """Its panel moves from light to light: what stands between cells does too."""
+    rungs = [r for r in PLAN_LADDER if r.cells == 8 or r.name == "learned_9x26, 16 cells, 16 steps, geometry volume"]
     judge = judge_of(tmp_path)
-    for rung in others:
+    for rung in rungs:
         judge.judge(rung, 0)
-    for rung in others:
-        alone, _ = judge_of(tmp_path).judge(rung, 2)
-        assert judge.judge(rung, 2)[0] == alone, rung.name
+    truth = judge.truth.level(2)
+    tables = [judge.truth.receivers(part) for part in truth.parts]
+    position, normal = (np.concatenate([getattr(t, name) for t in tables]) for name in ("position", "normal"))
+    for rung in rungs:
+        grid, found = judge.grid(rung), []
+        for number in truth.sets:
+            light = illuminate(judge.truth.lit(number), grid, rung.config, "direct")
+            found.append(Lpv(grid, rung.config)(light, light.receivers(position, normal)).detach().double().numpy())
+        anew = ErrorSamples.of(np.stack(found), truth.irradiance, truth.standard_error, truth.weight).estimate()
+        assert judge.judge(rung, 2)[0].error == pytest.approx(anew.error, rel=1e-6), rung.name
+        assert judge.judge(rung, 2)[0].high == pytest.approx(anew.high, rel=1e-6), rung.name
 
 
 @pytest.mark.parametrize("config", [
