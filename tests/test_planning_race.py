@@ -104,6 +104,9 @@ def test_one_that_was_judged_closely_saves_the_others_it():
     assert plan.chosen is None
     assert [name for name, level in judge.judged if level > 0] == ["rung 0"]
     assert [r.state for r in plan.runners] == ["out"] + 9 * ["unsure"]
+    # the best is the most accurate on the level that all were judged on, not the one that was judged most closely
+    assert plan.best.rung.name == "rung 9"
+    assert "best found rung 9: error 0.175" in explain(plan) and "judged roughly, on level 1 of 3" in explain(plan)
 
 
 def test_a_foretelling_leaves_a_margin():

@@ -38,6 +38,8 @@ def _verdict(plan: Plan) -> str:
     found = f"{best.rung.name}: error {e.error:.3f} ({bound}), {1e3 * best.seconds:.2f} ms a solve"
     if plan.chosen is not None:
         return f"{goal} is met by {found}"
+    if best.level < plan.last_level:
+        found += f"; judged roughly, on level {best.level + 1} of {plan.last_level + 1}"
     if plan.interrupted:
         return f"{goal}: interrupted; best so far {found}"
     return f"{goal} is not met by anything on the ladder; best found {found}"

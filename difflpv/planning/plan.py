@@ -52,14 +52,11 @@ class Plan:
 
     @property
     def best(self) -> Runner | None:
-        """What is chosen, or else the most accurate rung judged (within the budget), of those judged most closely."""
+        """What is chosen, or else the most accurate rung judged (within the budget), by the level that all were judged on."""
         if self.chosen is not None:
             return self.chosen
-        judged = [r for r in self.runners if r.estimate is not None and r.state != "dear"]
-        if not judged:
-            return None
-        closest = max(r.level for r in judged)
-        return min((r for r in judged if r.level == closest), key=_error)
+        judged = [r for r in self.runners if r.estimates and r.state != "dear"]
+        return min(judged, key=lambda r: r.estimates[0].error, default=None)
 
     @property
     def config(self) -> LpvConfig | None:
