@@ -118,6 +118,24 @@ def test_a_foretelling_leaves_a_margin():
     assert plan_with(judge, rungs_of(2), tolerance=0.2).runners[1].state == "unsure"
 
 
+def test_half_the_tolerance_is_foretold_by_what_a_closer_look_did_to_the_best():
+    """Read 0.12 under an easy light, 0.2 all told: not half of 0.3. What the tolerance has rejected meets no half of it."""
+    rungs = rungs_of(3)
+    errors = {"rung 0": 0.25, "rung 1": 0.2, "rung 2": 0.1}
+    judge = EasierFirst(errors, {"rung 0": 1.0, "rung 1": 1.05, "rung 2": 1.5}, 0.6, {r.name: 1.0 for r in rungs})
+    plan = plan_with(judge, rungs, tolerance=0.3)
+    assert plan.chosen.rung.name == "rung 0"
+    plan.runners[1].estimates[:] = [judge.judge(rungs[1], 0)[0]]
+    plan.runners[1].seconds = 1.05
+    assert plan.foreseen(plan.runners[1]) == pytest.approx(0.2)
+    assert "half the tolerance, 0.15: dearer rungs were not judged" in explain(plan)
+    plan.runners[2].estimates[:] = [judge.judge(rungs[2], 0)[0]]
+    plan.runners[2].seconds = 1.5
+    assert "half the tolerance, 0.15: likely rung 2 (0.100), 1500.00 ms" in explain(plan)
+    plan.runners[2].state = "unsure"
+    assert "half the tolerance, 0.15: dearer rungs were not judged" in explain(plan)
+
+
 def test_times_are_repeated_for_what_meets_the_tolerance_and_its_rivals_only():
     """A rough time of the cheapest, 1.2 times too long, does not cost it the choice."""
 

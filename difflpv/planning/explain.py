@@ -89,11 +89,11 @@ def half_tolerance(plan: Plan) -> str:
     if plan.tolerance is None or plan.best is None:
         return ""
     half = plan.tolerance / 2
-    judged = [r for r in plan.runners if r.estimate is not None and r.seconds is not None]
-    enough = [r for r in judged if r.estimate is not None and r.estimate.error <= half]
+    left = [r for r in plan.runners if r.estimates and r.seconds is not None and r.state in ("open", "met", "chosen")]
+    enough = [r for r in left if plan.foreseen(r) <= half]
     if enough:
         least = min(enough, key=lambda r: r.seconds or 0.0)
-        return f"half the tolerance, {half:g}: likely {least.rung.name} ({_error(least)}), {_milliseconds(least)} ms"
+        return f"half the tolerance, {half:g}: likely {least.rung.name} ({plan.foreseen(least):.3f}), {_milliseconds(least)} ms"
     front = [r for r in plan.front if r.seconds and r.estimate]
     waiting = any(r.state == "open" for r in plan.runners)
     hope = "dearer rungs were not judged" if waiting else "nothing on the ladder reached it"

@@ -63,6 +63,13 @@ class Plan:
         """Of the best rung; None for the constant, or where nothing was judged."""
         return None if self.best is None else self.best.rung.config
 
+    def foreseen(self, runner: Runner) -> float:
+        """Error to be expected of a judged rung on the level that the best one reached: as that changed from level to level."""
+        best, level = self.best, runner.level
+        if best is None or best.level <= level:
+            return _error(runner)
+        return _error(runner) * _error(best) / max(best.estimates[level].error, 1e-12)
+
     @property
     def front(self) -> list[Runner]:
         """Judged rungs that are more accurate than all cheaper ones, cheapest first, up to the best one."""
