@@ -150,8 +150,8 @@ ONLY = (
 
 # Only these parts may know the path tracer: what they judge must not.
 DATA_GEN_USERS = (
-    "data_gen", "difflpv.bench", "difflpv.cli", "difflpv.demo", "difflpv.placement.from_targets", "difflpv.planning",
-    "difflpv.stress", "difflpv.training", "scripts",
+    "data_gen", "difflpv.bench", "difflpv.cli", "difflpv.demo", "difflpv.placement.from_targets",
+    "difflpv.placement.held_out", "difflpv.planning", "difflpv.stress", "difflpv.training", "scripts",
 )  # fmt: skip
 
 LIBRARY_OWNERS: dict[str, tuple[str, ...]] = {

@@ -93,7 +93,7 @@ def judge(
     Raises:
         ValueError: wrong shapes, content that is not finite, or a truth that is black everywhere.
     """
-    position = np.asarray(position, np.float64)
+    position = np.array(position, np.float64)
     content = torch.as_tensor(radiance, dtype=torch.float64).detach()
     _check(task, position, content, surface)
     interpolation = reader.over(position, task.scene, raycaster=task.raycaster)
@@ -127,7 +127,7 @@ def point_errors(
     Raises:
         ValueError: as ``judge``.
     """
-    position = np.asarray(position, np.float64)
+    position = np.array(position, np.float64)
     content = torch.as_tensor(radiance, dtype=torch.float64).detach()
     _check(task, position, content, None)
     square, truth = _squares(task, position, reader.over(position, task.scene, raycaster=task.raycaster), content)

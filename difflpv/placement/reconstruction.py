@@ -26,13 +26,16 @@ def irradiance_coordinates(radiance: torch.Tensor) -> torch.Tensor:
     return torch.einsum("mkc,kj->mjc", radiance, _FACTOR.to(radiance))
 
 
-def fitted_content(task: PlacementTask, position: torch.Tensor, rows: Rows, *, ridge: float = RIDGE) -> torch.Tensor:
+def fitted_content(
+    task: PlacementTask, position: torch.Tensor, rows: Rows, *, ridge: float = RIDGE, toward: torch.Tensor | None = None
+) -> torch.Tensor:
     """Radiance SH [n,9,C] W/m2 that reconstructs the task's points best, differentiable in positions and weights.
 
-    Least squares over the points with a pull of ``ridge`` (share of the points per probe) toward the field's value, so that a
-    probe that few points read keeps it; the content of variable projection (Golub and Pereyra 1973).
+    Least squares over the points with a pull of ``ridge`` (share of the points per probe) toward other content, so that a
+    probe that few points read keeps that; the content of variable projection (Golub and Pereyra 1973). ``toward`` [n,9,C] is
+    that content; the field's value if None.
     """
-    start = task.field(position)
+    start = task.field(position) if toward is None else toward
     found = _least_squares(task, rows.dense(len(position)), start.flatten(1), task.radiance.flatten(1), ridge)
     return found.reshape(start.shape)
 
