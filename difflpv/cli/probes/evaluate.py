@@ -34,11 +34,11 @@ def add_parser(subparsers: Any) -> None:
         "the path-traced truth: relative L2 error of irradiance over 26 normals, its 95th percentile over points, the leak "
         "(error where the tetrahedron of probes around a point is cut by a wall), size, lookups per second of one core, "
         "probes inside of solids. Light sets that the placing targets have too are left out; by three quarters of the points "
-        "content is fitted, on the rest everything is judged.",
+        "content is fitted, on the rest everything is judged. 'difflpv probes targets SCENE --lights moved:4 --seed 1' makes "
+        "such targets.",
         example="""
-        difflpv probes targets cornell --lights moved:9 --out out/place
-        difflpv probes targets cornell --lights moved:4 --seed 1 --out out/judge
         difflpv probes evaluate cornell out/probes --targets out/judge --placed-by out/place
+        difflpv probes evaluate cornell out/grid out/ours --content traced --targets out/judge --json
         """,
     )
     parser.add_argument("probes", nargs="+", type=Path, metavar="PROBES", help="folders with probes.json")
