@@ -16,7 +16,10 @@ from difflpv.probes.probe_set import DIRECTIONS_26, irradiance_of
 from difflpv.probes.tetrahedra import TetrahedralInterpolation
 from difflpv.sh import sh_basis
 
-QUICK = {name: {"budget": 30} for name in ("sbplx", "crs2", "bobyqa", "cma")} | {"greedy_removal": {"dense": 2.0}}
+QUICK = {name: {"budget": 30} for name in ("sbplx", "crs2", "bobyqa", "cma")} | {
+    "greedy_removal": {"dense": 2.0},
+    "gradient": {"steps": 16, "relocations": 1},
+}
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -12,7 +12,7 @@ import torch
 
 from difflpv.placement.free_moves import FreeMoves
 from difflpv.placement.penalties import Penalties
-from difflpv.placement.reconstruction import Reconstruction
+from difflpv.placement.reconstruction import Reconstruction, fitted_content, relative_error
 from difflpv.placement.task import PlacementTask
 from difflpv.probes.gaussian import GaussianInterpolation
 from difflpv.probes.reader import InterpolationName
@@ -93,6 +93,25 @@ class Descent:
         """Training error without penalties."""
         position, metric = _tensors(probes)
         return float(self.reconstruction.error(position, self.reader(position, metric).rows(position, self.task.points)))
+
+    @torch.no_grad()
+    def content(self, probes: Probes) -> np.ndarray:
+        """Radiance SH [n,9,C] W/m2 fitted to the points."""
+        position, metric = _tensors(probes)
+        rows = self.reader(position, metric).rows(position, self.task.points)
+        return fitted_content(self.task, position, rows, ridge=self.reconstruction.ridge).numpy()
+
+    @torch.no_grad()
+    def error_at(self, probes: Probes, judge: PlacementTask) -> float:
+        """Relative L2 error at another task's points, with the content fitted to this one's (or the field's)."""
+        position, metric = _tensors(probes)
+        held = torch.as_tensor(self.content(probes)) if self.reconstruction.content == "fitted" else judge.field(position)
+        # no sight here that remembers: the points are others
+        reader = replace(self, sight=False).reader(position, metric)
+        if self.sight:
+            reader = VisibleInterpolation(reader, judge.scene, raycaster=self.task.raycaster)
+        rows = reader.rows(position, judge.points)
+        return float(relative_error(judge, rows.apply(held)))
 
     def run(
         self, probes: Probes, steps: int, *, rate: Callable[[float], float], told: Callable[[float], None] | None = None

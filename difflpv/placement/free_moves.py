@@ -14,6 +14,9 @@ Region = tuple[Sequence[float], Sequence[float]]
 """Lowest and highest corner [3] m of a box that probes may stand in."""
 
 
+_WITNESSES = 16
+
+
 class FreeMoves:
     """Judges moves for one task."""
 
@@ -32,7 +35,17 @@ class FreeMoves:
 
     def allowed(self, position: np.ndarray) -> np.ndarray:
         """True for positions [n,3] m in free space and in a region."""
-        return self._task.in_free_space(position) & (self._nearest(position) == position).all(1)
+        return np.asarray(self._task.in_free_space(position) & (self._nearest(position) == position).all(1))
+
+    def seen(self, position: np.ndarray) -> np.ndarray:
+        """True for positions [n,3] m that one of the nearest points sees: none of those in a solid that the lattice missed."""
+        from scipy.spatial import KDTree
+
+        points = self._task.points.numpy()
+        near = points[KDTree(points).query(position, min(_WITNESSES, len(points)))[1]].reshape(len(position), -1, 3)
+        there = np.broadcast_to(position[:, None], near.shape)
+        hidden = self._crosses(near.reshape(-1, 3), there.reshape(-1, 3)).reshape(near.shape[:2])
+        return np.asarray(~hidden.all(1))
 
     def moved(self, old: np.ndarray, new: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where probes at ``old`` [n,3] m, which are allowed, end on their way to ``new`` [n,3] m; and which of them stay [n].
@@ -54,7 +67,7 @@ class FreeMoves:
     def _crosses(self, old: np.ndarray, new: np.ndarray) -> np.ndarray:
         """Ways that meet a surface, looked at from both ends: a ray may miss one that it starts on."""
         rays = self._task.raycaster
-        return rays.blocked(old, new, shortened=False) | rays.blocked(new, old, shortened=False)
+        return np.asarray(rays.blocked(old, new, shortened=False) | rays.blocked(new, old, shortened=False))
 
     def _nearest(self, position: np.ndarray) -> np.ndarray:
         """The nearest place in a region."""

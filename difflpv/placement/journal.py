@@ -12,6 +12,7 @@ import torch
 from difflpv.placement.reconstruction import reconstruction_error
 from difflpv.placement.task import Placement, PlacementTask, Progress
 from difflpv.probes.lattice import LatticeField
+from difflpv.probes.reader import ProbeReader
 
 __all__ = ["Journal", "distinct"]
 
@@ -61,8 +62,10 @@ class Journal:
         """The error where no probe is left."""
         return ValueError(f"{self._method}: no probe lies in free space: check the clearance, or ask for more probes")
 
-    def placement(self, position: np.ndarray, **details: Any) -> Placement:
-        """The result.
+    def placement(
+        self, position: np.ndarray, *, radiance: np.ndarray | None = None, reader: ProbeReader | None = None, **details: Any
+    ) -> Placement:
+        """The result; without ``radiance`` probes hold the field's, without ``reader`` they are read in tetrahedra.
 
         Raises:
             ValueError: no probe is left, because none lay in free space.
@@ -71,8 +74,9 @@ class Journal:
             raise self.nothing_free()
         assert len(position) <= self._count
         seconds = time.perf_counter() - self._start
+        history = tuple(self._history)
         return Placement(
-            self._method, np.array(position), None, seconds, self.evaluations, tuple(self._history), details
+            self._method, np.array(position), radiance, seconds, self.evaluations, history, details, reader or ProbeReader()
         )
 
 

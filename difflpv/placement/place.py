@@ -19,6 +19,7 @@ PlacementMethod = Literal[
     "spawn_merge_hierarchical",
     "irradiance_ascent",
     "greedy_removal",
+    "gradient",
     "sbplx",
     "crs2",
     "bobyqa",
@@ -35,6 +36,7 @@ _MODULES = {
     "spawn_merge_hierarchical": "spawn_merge",
     "irradiance_ascent": "irradiance_ascent",
     "greedy_removal": "greedy_removal",
+    "gradient": "gradient",
 }
 
 

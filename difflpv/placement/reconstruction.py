@@ -13,7 +13,7 @@ from difflpv.probes.rows import Interpolation, Rows
 from difflpv.probes.tetrahedra import TetrahedralInterpolation
 from difflpv.sh import cosine_lobe
 
-__all__ = ["Content", "Reconstruction", "fitted_content", "irradiance_coordinates", "reconstruction_error"]
+__all__ = ["Content", "Reconstruction", "fitted_content", "irradiance_coordinates", "reconstruction_error", "relative_error"]
 
 Content = Literal["field", "fitted"]
 RIDGE = 0.02
@@ -43,39 +43,62 @@ def fitted_content(
 class Reconstruction:
     """The training error of probes at one task's points, as often as it is asked for.
 
+    The light of several sets has far fewer than 9C independent channels, and the error does not change where channels are
+    turned into one another: with ``kept`` below 1 only the principal ones stay that hold this share of the truth's energy.
+
     Attributes:
         task: points and their truth.
         content: what probes hold: the "field" where they are, or "fitted" (``fitted_content``).
-        truth: radiance at the points in ``irradiance_coordinates`` [m,9C].
+        truth: radiance at the points in ``irradiance_coordinates`` [m,K], K <= 9C.
+        ridge: of the least squares.
     """
 
-    def __init__(self, task: PlacementTask, content: Content = "field", *, ridge: float = RIDGE) -> None:
+    def __init__(
+        self, task: PlacementTask, content: Content = "field", *, ridge: float = RIDGE, kept: float = 1.0
+    ) -> None:
         """Take the truth.
 
         Raises:
-            ValueError: an unknown content, or a negative ridge.
+            ValueError: an unknown content, a negative ridge, or a share that is none.
         """
+        if not 0 < kept <= 1:
+            raise ValueError(f"kept: expected a share in (0, 1], got {kept}")
         if content not in ("field", "fitted"):
             raise ValueError(f"content: expected field or fitted, got {content!r}")
         if not ridge >= 0:
             raise ValueError(f"ridge: expected a number >= 0, got {ridge}")
         self.task, self.content = task, content
-        self._ridge = ridge
+        self.ridge = ridge
         self.truth = irradiance_coordinates(task.radiance).flatten(1)
         self._scale = float((task.weights[:, None] * self.truth.square()).sum().sqrt())
+        self._axes: torch.Tensor | None = None
+        if kept < 1:
+            energy, axes = torch.linalg.eigh(self.truth.T @ (self.truth * task.weights[:, None]))
+            lost = energy.clamp_min(0).cumsum(0) <= (1 - kept) * energy.sum()
+            self._axes = axes[:, ~lost]
+            self.truth = self.truth @ self._axes
 
     def read(self, position: torch.Tensor, rows: Rows) -> tuple[torch.Tensor, torch.Tensor]:
-        """What probes at ``position`` [n,3] m hold [n,9C] and what the points read by ``rows`` [m,9C], as ``truth``."""
+        """What probes at ``position`` [n,3] m hold [n,K] and what the points read by ``rows`` [m,K], as ``truth``."""
         held = irradiance_coordinates(self.task.field(position)).flatten(1)
+        if self._axes is not None:
+            held = held @ self._axes
         matrix = rows.dense(len(position))  # for as many channels as several lights have, cheaper than the rows' gather
         if self.content == "fitted":
-            held = _least_squares(self.task, matrix, held, self.truth, self._ridge)
+            held = _least_squares(self.task, matrix, held, self.truth, self.ridge)
         return held, matrix @ held
 
     def error(self, position: torch.Tensor, rows: Rows) -> torch.Tensor:
         """Relative L2 error of irradiance over 26 normals at the task's points, a scalar."""
         square = (self.read(position, rows)[1] - self.truth).square().sum(1)
         return (self.task.weights * square).sum().sqrt() / self._scale
+
+
+def relative_error(task: PlacementTask, radiance: torch.Tensor) -> torch.Tensor:
+    """Relative L2 error of irradiance over 26 normals, a scalar, of ``radiance`` [m,9,C] W/m2 at the task's points."""
+    weight = task.weights[:, None, None]
+    found, truth = irradiance_coordinates(radiance), irradiance_coordinates(task.radiance)
+    return ((weight * (found - truth).square()).sum() / (weight * truth.square()).sum()).sqrt()
 
 
 def reconstruction_error(
