@@ -1,4 +1,4 @@
-"""Lookups of light probes: points per second of CPU time on one thread, against scipy and the torch twin, and jumps at flips.
+"""Lookups of light probes: points per second of CPU time on one thread, against scipy and the torch twins, and jumps at flips.
 
     python benchmarks/probes_lookup.py [--probes 16 64 256 1024] [--points 200000] [--repeats 5] [--dtype float32|float64]
         [--scenes NAME ...] [--json OUT]
@@ -6,9 +6,10 @@
 Probes and points are uniform in a box, the probes' hull reaching its corners ("inside") or not ("mixed": some points lie
 outside and take the closest point of the hull). "cold": each walk starts in the first tetrahedron; "hinted": near where the
 same point was found last, after a move of 1 % of the box. A full lookup is locating, weighing and the irradiance of one normal
-from 9 x RGB. CPU time, because this machine is shared; the best of the repeats, taken in turns. Sight: in a bundled scene, 64
-probes and 4,000 receivers at random; the share of weight on probes that a ray shows to be blocked, before and after weights by
-sight.
+from 9 x RGB. Gaussian footprints, 8 neighbours: round ones, and "skewed" ones (a random matrix added, its entries 0.3 of the
+round one's); nothing is kept from call to call. CPU time, because this machine is shared; the best of the repeats, taken in
+turns. Sight: in a bundled scene, 64 probes and 4,000 receivers at random; the share of weight on probes that a ray shows to be
+blocked, before and after weights by sight.
 """
 
 from __future__ import annotations
@@ -26,10 +27,13 @@ from scipy.spatial import Delaunay
 
 from difflpv.io import load_scene
 from difflpv.probes.flips import flip_jumps
+from difflpv.probes.gaussian import GaussianInterpolation, isotropic_metric
 from difflpv.probes.lookup import probe_irradiance
+from difflpv.probes.rows import Interpolation
 from difflpv.probes.tetrahedra import Tetrahedra, TetrahedralInterpolation
 from difflpv.probes.visible import VisibleInterpolation
 from difflpv.raycast import Raycaster
+from difflpv.reference.gaussian import dense_footprint_weights
 from difflpv.reference.tetrahedra import dense_weights
 
 TWIN_POINTS = 500  # the twin tries every tetrahedron
@@ -72,6 +76,10 @@ def lookups(probes: int, points: int, repeats: int, dtype: torch.dtype, *, insid
     vertices, hull = (torch.as_tensor(t) for t in (grid.tetrahedra.vertices, grid.tetrahedra.hull))
     few = torch.as_tensor(read[:TWIN_POINTS])
     hinted = TetrahedralInterpolation(position)
+    metric = isotropic_metric(position)
+    noise = torch.as_tensor(rng.normal(size=metric.shape), dtype=dtype)
+    skewed = metric + 0.3 * metric.amax((1, 2), keepdim=True) * noise
+    footprints = {"gaussian": GaussianInterpolation(metric), "skewed gaussian": GaussianInterpolation(skewed)}
     calls: dict[str, Callable[[], object]] = {
         "cold rows": cold,
         "hinted rows": lambda: hinted.rows(position, next(places)),
@@ -79,25 +87,35 @@ def lookups(probes: int, points: int, repeats: int, dtype: torch.dtype, *, insid
         "hinted full lookup": lambda: probe_irradiance(hinted.rows(position, next(places)), radiance, normals),
         "scipy find_simplex": lambda: scipys.find_simplex(read),
     }
+    for name, reader in footprints.items():
+        calls[f"{name} rows"] = lambda reader=reader: reader.rows(position, here)
+        calls[f"{name} full lookup"] = lambda reader=reader: probe_irradiance(reader.rows(position, here), radiance, normals)
     rates = {name: points / s / 1e6 for name, s in best_seconds(calls, repeats).items()}
     (twin,) = best_seconds({"twin": lambda: dense_weights(torch.as_tensor(x), few, vertices, hull)}, 1).values()
     made = best_seconds({"ours": lambda: Tetrahedra.of(x), "scipy": lambda: Delaunay(x)}, repeats)
     rates["torch twin"] = TWIN_POINTS / twin / 1e6
+    (twin,) = best_seconds({"twin": lambda: dense_footprint_weights(position, skewed, here[:TWIN_POINTS], 8)}, 1).values()
+    rates["gaussian torch twin"] = TWIN_POINTS / twin / 1e6
     return rates | {"triangulate ms": made["ours"] * 1e3, "scipy Delaunay ms": made["scipy"] * 1e3}
 
 
 def optimiser_step(probes: int, points: int, repeats: int) -> dict[str, float]:
-    """Milliseconds of rows and of their gradient in float64, triangulated anew in each call or held."""
+    """Milliseconds of rows and of their gradient in float64: triangulated anew in each call, held, or by footprints."""
     rng = np.random.default_rng(probes)
     x, read = rng.random((probes, 3)), torch.as_tensor(rng.random((points, 3)))
     result = {}
-    for kind in ("fresh", "held"):
-        grid = TetrahedralInterpolation(x, connectivity=kind)  # type: ignore[arg-type]
+    metric = isotropic_metric(torch.as_tensor(x)).requires_grad_()
+    readers: dict[str, Interpolation] = {
+        "fresh": TetrahedralInterpolation(x),
+        "held": TetrahedralInterpolation(x, connectivity="held"),
+        "gaussian": GaussianInterpolation(metric),
+    }
+    for kind, reader in readers.items():
         forward, backward = [], []
         for _ in range(repeats + 1):
             position = torch.as_tensor(x + rng.normal(size=x.shape) * 1e-4).requires_grad_()
             start = time.process_time()
-            weight = grid.rows(position, read).weight
+            weight = reader.rows(position, read).weight
             middle = time.process_time()
             weight.square().sum().backward()
             forward.append(middle - start)

@@ -5,6 +5,7 @@ import warp as wp
 
 from difflpv import bridge
 from warp_kernels.direct import direct_kernels
+from warp_kernels.gaussian import gaussian_kernels
 from warp_kernels.injection import injection_kernels
 from warp_kernels.linear_propagation import matrices_kernel, step_kernel
 from warp_kernels.occlusion import occlusion_kernels
@@ -25,6 +26,7 @@ KERNELS = {
     "propagation": lambda s: forward_kernel(s, **FACES),
     "propagation adjoint": lambda s: adjoint_kernel(s, **FACES, need_factor=True, need_transmittance=True),
     "direct": lambda s: direct_kernels(s)[0],
+    "gaussian": lambda s: gaussian_kernels(s).nearest_of_all,
     "injection": lambda s: injection_kernels(s)[0],
     "occlusion": lambda s: occlusion_kernels(s)[0],
     "rsm": lambda s: rsm_kernels(s)[0],

@@ -10,8 +10,9 @@ A point reads the k probes of least d_j. With d_(1) the least and d_(k+1) the le
     w_j ~ exp(-(d_j - d_(1)) / 2) - exp(-(d_(k+1) - d_(1)) / 2) + 1e-9,    normalised
 
 so that a probe that drops out of the k nearest has lost its weight before (up to the 1e-9 that keeps points at equal distance
-from more than k probes defined): weights are continuous in points, positions and metrics, and defined for any probes, also
-coplanar ones, duplicates and a single one. A wall needs no ray where the footprints on its two sides are flat along it.
+from more than k probes defined): weights are continuous in points, positions and metrics but for places that are equally far
+from the k + 1 nearest (with k = 1, half-way between two probes), and defined for any probes, also coplanar ones, duplicates and
+a single one. A wall needs no ray where the footprints on its two sides are flat along it.
 """
 
 from __future__ import annotations
@@ -19,12 +20,12 @@ from __future__ import annotations
 import torch
 
 from difflpv.coordinates import check_points
+from difflpv.probes.footprints import nearest_footprints
 from difflpv.probes.rows import Rows
 
 __all__ = ["GaussianInterpolation", "isotropic_metric"]
 
 _LEAST = 1e-9
-_PAIRS = 2**21  # of point and probe, looked at in one go
 
 
 class GaussianInterpolation:
@@ -63,27 +64,13 @@ class GaussianInterpolation:
         check_points("points", points, like=position)
         if len(position) != len(self.metric):
             raise ValueError(f"position: expected {len(self.metric)} probes, got {len(position)}")
-        metric = self.metric.to(position)
-        near = nearest_footprints(position.detach(), metric.detach(), points.detach(), self._neighbours + 1)
-        offset = points[:, None] - position.index_select(0, near.flatten()).reshape(*near.shape, 3)
-        footprint = metric.flatten(1).index_select(0, near.flatten()).reshape(*near.shape, 3, 3)  # its adjoint adds fast
-        distance = (footprint * offset[:, :, None]).sum(-1).square().sum(-1)
+        count = min(self._neighbours + 1, len(position))
+        near, distance = nearest_footprints(position, self.metric.to(position), points, count)
         share = torch.exp(-0.5 * (distance - distance[:, :1]))
         if len(position) > self._neighbours:
             share = (share[:, :-1] - share[:, -1:]).clamp_min(0) + _LEAST
             near = near[:, :-1]
-        return Rows(near, share / share.sum(1, keepdim=True))
-
-
-def nearest_footprints(position: torch.Tensor, metric: torch.Tensor, points: torch.Tensor, count: int) -> torch.Tensor:
-    """The ``count`` probes of least d_j (all, if there are fewer) of each point, nearest first: indices [m,count] int64."""
-    found = []
-    center = torch.einsum("nij,nj->ni", metric, position)
-    for part in points.split(max(1, _PAIRS // len(position))):
-        moved = (part @ metric.reshape(-1, 3).T).reshape(len(part), -1, 3)
-        distance = (moved - center).square().sum(-1)
-        found.append(distance.topk(min(count, len(position)), largest=False).indices)
-    return torch.cat(found) if found else torch.empty((0, min(count, len(position))), dtype=torch.int64)
+        return Rows(near.long(), share / share.sum(1, keepdim=True))
 
 
 def isotropic_metric(position: torch.Tensor, *, width: float = 0.6) -> torch.Tensor:
