@@ -7,6 +7,7 @@ from difflpv.placement.edge_rays import tetrahedra_cut_by_walls, with_edge_rays
 from difflpv.placement.reconstruction import reconstruction_error
 from difflpv.placement.task import Placement
 from difflpv.placement.uniform import place_grid
+from difflpv.probes.reader import ProbeReader
 from difflpv.probes.tetrahedra import Tetrahedra
 
 # One tetrahedron, three of its edges through the wall at x = 0.1.
@@ -45,6 +46,12 @@ def test_the_rules_keep_clusters_away(task):
     # A ray along the surface does not count, whatever it hits.
     assert len(with_edge_rays(task, hand, grazing=0.999)) == 4
     assert len(with_edge_rays(task, hand, count=5)) == 5
+
+
+def test_footprints_are_refused(task):
+    hand = Placement("hand", ACROSS, reader=ProbeReader("gaussian", np.stack([np.eye(3)] * 4)))
+    with pytest.raises(ValueError, match="edge rays: expected probes that are read in tetrahedra"):
+        with_edge_rays(task, hand)
 
 
 def test_more_rounds_than_walls_end_by_themselves(task):

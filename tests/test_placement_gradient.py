@@ -98,6 +98,14 @@ def test_moves_never_cross_a_wall_nor_leave_a_region(task):
         FreeMoves(task, [((0, 0, 0), (0, 1, 1))])
 
 
+def test_a_region_between_the_probes_of_every_grid_gets_probes(task):
+    low, high = task.points[7].numpy() - 0.02, task.points[7].numpy() + 0.02
+    placement = place(task, 3, "gradient", regions=[(low, high)], **QUICK)
+    assert len(placement) >= 1 and ((placement.position >= low) & (placement.position <= high)).all()
+    with pytest.raises(ValueError, match="no probe lies in free space"):
+        place(task, 3, "gradient", regions=[((7, 7, 7), (8, 8, 8))], **QUICK)
+
+
 def test_a_probe_that_no_point_sees_counts_as_inside_a_solid():
     task = analytic_task(block=True)
     moves = FreeMoves(task)
@@ -185,6 +193,7 @@ def test_interrupted_work_keeps_the_best_and_goes_on_to_the_same_bits(task, tmp_
     resumed = place(task, 10, "gradient", **options)
     assert not resumed.details["interrupted"] and len(calls) == 4  # one done, one broken off, that one and the last anew
     assert np.array_equal(resumed.position, whole.position) and np.array_equal(resumed.reader.metric, whole.reader.metric)
+    assert resumed.evaluations == whole.evaluations  # of all runs together
     with pytest.raises(CheckpointError, match="seed"):
         place(task, 10, "gradient", seed=1, **options)
 

@@ -63,8 +63,10 @@ def with_edge_rays(
         The placement with the new probes after the old ones; ``details`` says how many edges were cut and probes refused.
 
     Raises:
-        ValueError: an option out of range.
+        ValueError: an option out of range, or footprints, which new probes would not have.
     """
+    if placement.reader.metric is not None:
+        raise ValueError("edge rays: expected probes that are read in tetrahedra, got gaussian footprints")
     if rounds < 1 or not 0 <= end_share < 0.5 or not 0 <= separation <= 1 or not 0 <= grazing < 1:
         raise ValueError(
             "edge rays: expected rounds >= 1, end_share in [0, 0.5), separation in [0, 1], grazing in [0, 1), "

@@ -42,7 +42,8 @@ class FreeMoves:
         from scipy.spatial import KDTree
 
         points = self._task.points.numpy()
-        near = points[KDTree(points).query(position, min(_WITNESSES, len(points)))[1]].reshape(len(position), -1, 3)
+        witnesses = min(_WITNESSES, len(points))
+        near = points[KDTree(points).query(position, witnesses)[1]].reshape(len(position), witnesses, 3)
         there = np.broadcast_to(position[:, None], near.shape)
         hidden = self._crosses(near.reshape(-1, 3), there.reshape(-1, 3)).reshape(near.shape[:2])
         return np.asarray(~hidden.all(1))

@@ -185,8 +185,12 @@ def _start(descent: Descent, journal: Journal, count: int, seed: int) -> Probes:
             journal.evaluations += 1
             if best is None or error < best[0]:
                 best = error, probes
-    if best is None:
-        raise journal.nothing_free()
+    if best is None:  # narrow regions between the probes of all grids: one at a point in them, more are spawned
+        inside = journal.task.points.numpy()
+        inside = inside[descent.moves.allowed(inside)]
+        if not len(inside):
+            raise journal.nothing_free()
+        best = math.inf, _with_footprints(descent, inside[:1])
     missing = count - len(best[1])
     return with_spawned(descent, best[1], missing) if missing else best[1]
 

@@ -23,6 +23,7 @@ class Journal:
     Attributes:
         task: what is known.
         evaluations: how often the field was taken at all probes.
+        seconds_before: spent by earlier runs of the same work, whose results are taken from a checkpoint.
     """
 
     def __init__(self, task: PlacementTask, method: str, count: int, progress: Progress | None) -> None:
@@ -35,6 +36,7 @@ class Journal:
             raise ValueError(f"{method}: expected at least 1 probe, got {count}")
         self.task = task
         self.evaluations = 0
+        self.seconds_before = 0.0
         self._method, self._count, self._progress = method, count, progress
         self._history: list[tuple[int, float, int]] = []
         self._start = time.perf_counter()
@@ -73,7 +75,7 @@ class Journal:
         if not len(position):
             raise self.nothing_free()
         assert len(position) <= self._count
-        seconds = time.perf_counter() - self._start
+        seconds = self.seconds_before + time.perf_counter() - self._start
         history = tuple(self._history)
         return Placement(
             self._method, np.array(position), radiance, seconds, self.evaluations, history, details, reader or ProbeReader()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from difflpv.placement.task import PlacementTask
 
 __all__ = ["Segments", "task_digest"]
 
+_FORMAT = 2  # of a segment's entries
 _TOLD_EVERY = 10  # steps
 
 
@@ -44,7 +46,7 @@ class Segments:
         self.journal = journal
         self.best: Probes | None = None
         self._path = None if checkpoint is None else Path(checkpoint)
-        self._identity = dict(identity)
+        self._identity = {"segments": _FORMAT, **identity}
         self._done: list[dict[str, Any]] = []
         self._next = 0
         if self._path is not None:
@@ -58,6 +60,8 @@ class Segments:
             kept = self._done[number]
             result = Probes(kept["position"].numpy(), None if kept["metric"] is None else kept["metric"].numpy())
             error = float(kept["error"])
+            self.journal.evaluations += _evaluations(steps)
+            self.journal.seconds_before += float(kept["seconds"])
             self.journal.note(len(result), error)
             return result, error
         since = 0
@@ -68,13 +72,21 @@ class Segments:
                 self.journal.note(len(probes), error)
             since += 1
 
+        start = time.perf_counter()
         result, error = descent.run(probes, steps, rate=lambda done: first + done * (last - first), told=told)
-        self.journal.evaluations += 2 * (steps + 1)
+        self.journal.evaluations += _evaluations(steps)
         metric = None if result.metric is None else torch.from_numpy(result.metric)
-        self._done.append({"position": torch.from_numpy(result.position), "metric": metric, "error": error})
+        seconds = time.perf_counter() - start
+        self._done.append(
+            {"position": torch.from_numpy(result.position), "metric": metric, "error": error, "seconds": seconds}
+        )
         if self._path is not None:
             save_checkpoint(self._path, self._identity, {"segments": self._done})
         return result, error
+
+
+def _evaluations(steps: int) -> int:
+    return 2 * (steps + 1)
 
 
 def task_digest(task: PlacementTask) -> str:
