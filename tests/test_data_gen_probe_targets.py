@@ -208,7 +208,8 @@ def test_task_has_the_light_of_the_chosen_lights_and_points(made):
             task.field.values[..., channel].numpy()[made.free], made.lattice[light][made.free][..., rgb]
         )
     assert (task.field.values[..., 0, :] > 0).all()  # walls and block hold their neighbours' light
-    np.testing.assert_array_equal(task.in_free_space(made.grid.cell_centers().reshape(-1, 3)), made.free.ravel())
+    centers = made.grid.cell_centers().reshape(-1, 3)
+    np.testing.assert_array_equal(task.in_free_space(centers, seen=False), made.free.ravel())
     assert not task.in_free_space(np.array([[1.0, 0, 0], [2.2, 0, 0], [0, 9.0, 0]])).any()
     assert placement_task(scene, made, points=slice(10, 14)).radiance.shape == (4, 9, 6)
 

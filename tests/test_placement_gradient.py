@@ -17,6 +17,7 @@ from difflpv.placement.population import removal_damage, with_spawned, without_l
 from difflpv.placement.reconstruction import Reconstruction, irradiance_coordinates, reconstruction_error
 from difflpv.placement.uniform import place_grid
 from difflpv.probes.gaussian import GaussianInterpolation, isotropic_metric
+from difflpv.probes.lattice import LatticeField
 from difflpv.probes.probe_set import DIRECTIONS_26, irradiance_of
 from difflpv.probes.visible import VisibleInterpolation
 
@@ -108,8 +109,11 @@ def test_a_region_between_the_probes_of_every_grid_gets_probes(task):
 
 def test_a_probe_that_no_point_sees_counts_as_inside_a_solid():
     task = analytic_task(block=True)
-    moves = FreeMoves(task)
-    assert moves.seen(np.array([[1.1, -0.15, -0.1], [-1.0, 0.0, 0.0]])).tolist() == [False, True]
+    position = np.array([[1.1, -0.15, -0.1], [-1.0, 0.0, 0.0]])
+    assert task.seen(position).tolist() == [False, True]
+    missed = replace(task, clearance=LatticeField(task.clearance.grid, torch.ones_like(task.clearance.values)))
+    assert missed.in_free_space(position).tolist() == [False, True]  # a lattice too coarse for the block
+    assert missed.in_free_space(position, seen=False).all()
 
 
 def test_each_penalty_falls_where_it_is_obeyed(task):

@@ -14,9 +14,6 @@ Region = tuple[Sequence[float], Sequence[float]]
 """Lowest and highest corner [3] m of a box that probes may stand in."""
 
 
-_WITNESSES = 16
-
-
 class FreeMoves:
     """Judges moves for one task."""
 
@@ -37,17 +34,6 @@ class FreeMoves:
         """True for positions [n,3] m in free space and in a region."""
         return np.asarray(self._task.in_free_space(position) & (self._nearest(position) == position).all(1))
 
-    def seen(self, position: np.ndarray) -> np.ndarray:
-        """True for positions [n,3] m that one of the nearest points sees: none of those in a solid that the lattice missed."""
-        from scipy.spatial import KDTree
-
-        points = self._task.points.numpy()
-        witnesses = min(_WITNESSES, len(points))
-        near = points[KDTree(points).query(position, witnesses)[1]].reshape(len(position), witnesses, 3)
-        there = np.broadcast_to(position[:, None], near.shape)
-        hidden = self._crosses(near.reshape(-1, 3), there.reshape(-1, 3)).reshape(near.shape[:2])
-        return np.asarray(~hidden.all(1))
-
     def moved(self, old: np.ndarray, new: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where probes at ``old`` [n,3] m, which are allowed, end on their way to ``new`` [n,3] m; and which of them stay [n].
 
@@ -60,7 +46,7 @@ class FreeMoves:
             if not len(rest):
                 break
             wanted = self._nearest(old[rest] + share * (new[rest] - old[rest]))
-            able = self._task.in_free_space(wanted) & ~self._crosses(old[rest], wanted)
+            able = self._task.in_free_space(wanted, seen=False) & ~self._crosses(old[rest], wanted)
             position[rest[able]] = wanted[able]
             stay[rest[able]] = False
         return position, stay

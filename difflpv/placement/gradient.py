@@ -168,14 +168,12 @@ class _Work:
 
 
 def _start(descent: Descent, journal: Journal, count: int, seed: int) -> Probes:
-    """The grid of least error, shaken, without probes that no point sees; filled up where most error is."""
+    """The grid of least error, shaken, filled up where most error is."""
     best: tuple[float, Probes] | None = None
     random = np.random.default_rng(seed)
     for spread in SPREADS:
         for grid in uniform_grids(journal.task, count, spread):
-            free = descent.moves.allowed(grid.position)
-            position = grid.position[free]
-            position = position[descent.moves.seen(position)]
+            position = grid.position[descent.moves.allowed(grid.position)]
             if not len(position):
                 continue
             shaken = position + _SHAKE * grid.spacing * random.uniform(-1, 1, position.shape)

@@ -18,6 +18,8 @@ from difflpv.scene import Scene
 
 __all__ = ["Placement", "PlacementTask", "Progress"]
 
+_WITNESSES = 16
+
 Progress = Callable[[int, float, int], None]
 """Called with the step, the current training error (NaN where a method knows none) and the number of probes."""
 
@@ -75,9 +77,33 @@ class PlacementTask:
         points = self.points.numpy()
         return points.min(0), points.max(0)
 
-    def in_free_space(self, position: np.ndarray, margin: float = 0.0) -> np.ndarray:
-        """True for positions [n,3] m at least ``margin`` m off every surface and in no solid, by the clearance lattice."""
-        return (self.clearance(torch.as_tensor(position, dtype=torch.float64)) > margin).numpy()
+    def in_free_space(self, position: np.ndarray, margin: float = 0.0, *, seen: bool = True) -> np.ndarray:
+        """True for positions [n,3] m at least ``margin`` m off every surface and in no solid.
+
+        The clearance lattice says so, and, unless it is not asked for, one of the nearest points that sees the position: the
+        lattice misses walls that are thinner than its cells.
+        """
+        free: np.ndarray = (self.clearance(torch.as_tensor(position, dtype=torch.float64)) > margin).numpy()
+        if seen and free.any():
+            free[free] = self.seen(np.asarray(position, np.float64)[free])
+        return free
+
+    def seen(self, position: np.ndarray) -> np.ndarray:
+        """True for positions [n,3] m that one of the nearest points sees: none in a solid does."""
+        points = self.points.numpy()
+        witnesses = min(_WITNESSES, len(points))
+        near = points[self._tree.query(position, witnesses)[1]].reshape(len(position), witnesses, 3)
+        there = np.broadcast_to(position[:, None], near.shape).reshape(-1, 3)
+        ends = near.reshape(-1, 3)
+        # looked at from both ends: a ray may miss a surface that it starts on
+        hidden = self.raycaster.blocked(ends, there, shortened=False) | self.raycaster.blocked(there, ends, shortened=False)
+        return np.asarray(~hidden.reshape(len(position), witnesses).all(1))
+
+    @cached_property
+    def _tree(self) -> Any:
+        from scipy.spatial import KDTree
+
+        return KDTree(self.points.numpy())
 
 
 @dataclass(frozen=True, eq=False)
