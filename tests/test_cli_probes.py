@@ -6,6 +6,7 @@ import json
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +17,9 @@ from data_gen.probe_targets import load_probe_targets
 from difflpv.cli.probes import SUBCOMMANDS
 from difflpv.cli.probes.export import FORMATS
 from difflpv.io.exports import EXPORT_FORMATS
-from difflpv.probes.probe_files import ProbeRecord, save_probes
+from difflpv.probes.probe_files import ProbeRecord, load_probes, save_probes
 from difflpv.probes.probe_set import ProbeSet
+from difflpv.probes.reader import ProbeReader
 
 
 @pytest.fixture
@@ -61,6 +63,19 @@ def test_export_writes_what_it_says(format, folder, tmp_path, capsys) -> None:
     assert all(sizes) and sum(sizes) == told["bytes"]
     assert difflpv("probes", "export", folder, "--format", format, "--out", out) == 0
     assert capsys.readouterr().out.startswith(f"5 probes (1 invalid ones left out) for {format} -> ")
+
+
+def test_export_says_what_an_engine_does_with_footprints(folder, tmp_path, capsys) -> None:
+    record = load_probes(folder)
+    save_probes(folder, replace(record, reader=ProbeReader("gaussian", np.tile(np.eye(3), (6, 1, 1)))))
+    line = "probes made to be read by Gaussian footprints of 8 neighbours: Unity blends in tetrahedra of its own"
+    assert difflpv("probes", "export", folder, "--format", "unity", "--out", tmp_path / "a", "--json") == 0
+    told = capsys.readouterr()
+    assert told.err.startswith(f"warning: {line}") and told.err.count("\n") == 1
+    assert json.loads(told.out)["warnings"][0].startswith(line)
+    assert difflpv("probes", "export", folder, "--format", "gltf", "--out", tmp_path / "a.gltf", "--json") == 0
+    told = capsys.readouterr()
+    assert told.err == "" and json.loads(told.out)["warnings"] == []
 
 
 @pytest.mark.parametrize(

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from engine_shaders import godot_ambient, godot_tap, openexr_direction, polynomial_value, threejs_irradiance
 
-from difflpv.io.exports import EXPORT_FORMATS, export_probes
+from difflpv.io.exports import EXPORT_FORMATS, export_probes, export_warnings
 from difflpv.io.exports.convention import BASIS_SCALE, ExportError, mirrored
 from difflpv.io.exports.exr import tile_directions
 from difflpv.io.exports.plane_tree import plane_tree
 from difflpv.io.exr import read_exr
 from difflpv.probes.probe_files import ProbeRecord
 from difflpv.probes.probe_set import DIRECTIONS_26, ProbeSet, irradiance_of
+from difflpv.probes.reader import ProbeReader
 from difflpv.sh import sh_basis
 
 # Toward the light: every axis, both ways, and one oblique direction without two equal components.
@@ -213,6 +216,46 @@ def test_every_export_says_what_it_is(tmp_path) -> None:
         assert (record["scene"], record["method"], record["errors"]) == ({"name": "box", "hash": "ab"}, "gradient", {"l2": 0.2})
         again = export_probes(lit_record(), tmp_path / format / names.get(format, ""), format=format)
         assert again == files and not list(tmp_path.rglob("*.tmp*"))
+
+
+def footprint_weights(point: np.ndarray, position: np.ndarray, metric: np.ndarray, neighbours: int) -> np.ndarray:
+    """As the words of the exported record say, for more probes than neighbours."""
+    d = (np.einsum("nij,nj->ni", metric, point - position) ** 2).sum(1)
+    order = np.argsort(d)
+    first, after = d[order[0]], d[order[neighbours]]
+    weight = np.zeros(len(d))
+    near = order[:neighbours]
+    weight[near] = np.exp(-(d[near] - first) / 2) - np.exp(-(after - first) / 2) + 1e-9
+    return weight / weight.sum()
+
+
+@pytest.mark.parametrize("format", EXPORT_FORMATS)
+def test_footprints_go_along_or_are_warned_of(format, tmp_path) -> None:
+    plain = lit_record()
+    metric = np.eye(3) + 0.2 * np.random.default_rng(0).normal(size=(8, 3, 3))
+    record = replace(plain, reader=ProbeReader("gaussian", metric, neighbours=3))
+    out = tmp_path / {"threejs": "a.json", "gltf": "a.gltf", "exr": "a.exr"}.get(format, "a")
+    files = export_probes(record, out, format=format)
+    (convention,) = [r for r in map(find_convention, files) if r is not None]
+    assert convention["interpolation"]["made_for"] == "Gaussian footprints of 3 neighbours"
+    assert export_warnings(plain, format=format) == []
+    warnings = export_warnings(record, format=format)
+    seeing = export_warnings(replace(plain, reader=ProbeReader(sight=True)), format=format)
+    if format not in ("threejs", "gltf"):
+        (line,), (other,) = warnings, seeing
+        assert line.startswith("probes made to be read by Gaussian footprints of 3 neighbours: ") and "\n" not in line
+        assert convention["interpolation"]["engine"] in line and "tetrahedra, weighted by sight: " in other
+        return
+    assert warnings == seeing == []
+    document = json.loads(files[0].read_text())
+    root, *nodes = document["nodes"] if format == "gltf" else (document["object"], *document["object"]["children"])
+    place = "extras" if format == "gltf" else "userData"
+    reader, carried = root[place]["reader"], np.array([node[place]["metric"] for node in nodes])
+    assert (reader["interpolation"], reader["neighbours"], reader["sight"]) == ("gaussian", 3, False)
+    rows = ProbeReader("gaussian", metric[np.arange(8) != 3], neighbours=3).over(POSITION, None)  # type: ignore[arg-type]
+    for point in np.random.default_rng(1).uniform(0, 2, (20, 3)):
+        expected = rows.rows(torch.from_numpy(POSITION), torch.from_numpy(point[None])).dense(7)[0]
+        np.testing.assert_allclose(footprint_weights(point, POSITION, carried, 3), expected, atol=1e-6)
 
 
 def find_convention(file: Path):

@@ -256,6 +256,17 @@ def test_readers_make_the_interpolation_that_they_name():
     assert torch.equal(by_footprints.rows(x, points).dense(12), dense(x, metric, points, 3))
 
 
+def test_readers_of_some_probes_keep_their_footprints():
+    metric = np.random.default_rng(0).normal(size=(4, 3, 3))
+    reader = ProbeReader("gaussian", metric, neighbours=3, sight=True)
+    kept = reader.kept(np.array([True, False, True, False]))
+    np.testing.assert_array_equal(kept.metric, metric[::2])
+    assert (kept.neighbours, kept.sight, kept.described) == (3, True, "Gaussian footprints of 3 neighbours, weighted by sight")
+    assert ProbeReader(sight=True).kept(np.array([0])).described == "tetrahedra, weighted by sight"
+    metric[0] = 7  # the reader has its own
+    assert reader.metric[0, 0, 0] != 7
+
+
 def test_readers_with_sight_read_nothing_through_a_wall():
     rng = np.random.default_rng(0)
     x = rng.uniform(-0.9, 0.9, (10, 3))
@@ -294,7 +305,11 @@ def test_eyes_over_another_interpolation_share_what_was_seen(monkeypatch):
         (lambda m: ProbeReader("trilinear"), "interpolation: expected tetrahedra or gaussian, got 'trilinear'"),
         (lambda m: ProbeReader("gaussian"), "metric: expected one a probe with gaussian footprints"),
         (lambda m: ProbeReader("tetrahedra", m), "none with tetrahedra"),
-        (lambda m: ProbeReader("gaussian", m, neighbours=0), "neighbours: expected a number > 0, got 0"),
+        (lambda m: ProbeReader("gaussian", m[0]), r"metric: expected shape \[n,3,3\] with n > 0, got \[3, 3\]"),
+        (lambda m: ProbeReader("gaussian", m * np.nan), "metric: expected finite numbers"),
+        (lambda m: ProbeReader("gaussian", m, sight=1), "sight: expected True or False, got 1"),
+        (lambda m: ProbeReader("gaussian", m, neighbours=2.5), "neighbours: expected a whole number > 0, got 2.5"),
+        (lambda m: ProbeReader("gaussian", m, neighbours=0), "neighbours: expected a whole number > 0, got 0"),
     ],
 )
 def test_readers_check_themselves(make, message):

@@ -12,13 +12,14 @@ from cli_room import difflpv, write_room
 
 from data_gen.load import TargetsError
 from data_gen.probe_targets import make_probe_targets
-from difflpv.cli.probes.judged import CONTENTS
+from difflpv.cli.probes.judged import CONTENTS, PlacedProbes
 from difflpv.io import load_scene
 from difflpv.placement.held_out import BAKED_CONTENTS, HeldOut
 from difflpv.placement.reconstruction import fitted_content
 from difflpv.probes.probe_files import ProbeRecord, save_probes
 from difflpv.probes.probe_set import DIRECTIONS_26, ProbeSet, irradiance_of
 from difflpv.probes.reader import ProbeReader
+from difflpv.report import scene_figures
 from difflpv.report.probe_errors import error_picture
 
 TINY = {"cells": 3, "spp": 64, "lattice_spp": 32, "component": "direct"}
@@ -119,6 +120,25 @@ def test_show_draws_one_or_two_panels_and_sums_up(world, tmp_path, capsys):
     told = json.loads(capsys.readouterr().out)
     assert told["probes"] == 6 and told["lights"] == [1, 2] and told["error"] > 0
     assert len((tmp_path / "a.png").read_bytes()) > 1.2 * len(alone)
+
+
+def test_footprints_of_a_file_are_what_judges_read_and_tetrahedra_are_not_drawn(world, tmp_path, capsys, monkeypatch):
+    folder, scene, placing, _ = world
+    position, valid = np.insert(placing.points[:6], 2, 99.0, axis=0), np.arange(7) != 2
+    metric = np.random.default_rng(0).normal(size=(7, 3, 3))
+    reader, described = ProbeReader("gaussian", metric, neighbours=5), {"name": scene.name, "hash": scene.hash}
+    save_probes(tmp_path, ProbeRecord(ProbeSet(position, np.ones((7, 9, 3)), valid), described, reader=reader))
+    placed = PlacedProbes.of(tmp_path, scene)
+    np.testing.assert_array_equal(placed.position, placing.points[:6])
+    np.testing.assert_array_equal(placed.reader.metric, metric[valid])
+    assert (placed.reader.interpolation, placed.reader.neighbours) == ("gaussian", 5)
+    drawn = []
+    monkeypatch.setattr(scene_figures, "probe_picture", lambda scene, probes, *, edges: drawn.append(edges))
+    monkeypatch.setattr(scene_figures, "draw_pictures", lambda pictures, titles: b"")
+    assert difflpv("probes", "show", folder / "room.glb", tmp_path, "--out", tmp_path / "a.png") == 0
+    assert "read by Gaussian footprints of 5 neighbours: " in capsys.readouterr().out
+    assert difflpv("probes", "show", folder / "room.glb", folder / "probes", "--out", tmp_path / "a.png") == 0
+    assert drawn[0] is None and len(drawn[1])
 
 
 def test_error_picture_is_brighter_where_the_error_is(world):

@@ -16,9 +16,13 @@ from safetensors.numpy import load_file, save
 
 from difflpv.probes.probe_files import CONVENTION, ProbeFileError, ProbeRecord, load_probes, save_probes
 from difflpv.probes.probe_set import ProbeSet
+from difflpv.probes.reader import ProbeReader
 from difflpv.sh import sh_basis
 
 NUMBERS = st.floats(-1e6, 1e6, width=64)
+
+
+METRIC = np.random.default_rng(4).normal(size=(5, 3, 3))
 
 
 def some_probes(count: int = 5) -> ProbeSet:
@@ -27,7 +31,9 @@ def some_probes(count: int = 5) -> ProbeSet:
 
 
 def saved(folder: Path) -> Path:
-    record = ProbeRecord(some_probes(), {"name": "box", "hash": "ab12"}, "gradient", {"relative L2": 0.25}, {"seed": 7})
+    footprints = ProbeReader("gaussian", METRIC, neighbours=3, sight=True)
+    described = {"name": "box", "hash": "ab12"}
+    record = ProbeRecord(some_probes(), described, "gradient", {"relative L2": 0.25}, {"seed": 7}, footprints)
     save_probes(folder / "probes", record)
     return folder / "probes"
 
@@ -47,9 +53,21 @@ def test_record_comes_back_and_says_what_the_numbers_are(tmp_path) -> None:
     back = load_probes(folder)
     assert (back.scene, back.method) == ({"name": "box", "hash": "ab12"}, "gradient")
     assert (back.errors, back.provenance) == ({"relative L2": 0.25}, {"seed": 7})
+    assert back.reader.metric is not None and back.reader.metric.tobytes() == METRIC.tobytes()
+    assert (back.reader.interpolation, back.reader.neighbours, back.reader.sight) == ("gaussian", 3, True)
+    np.testing.assert_array_equal(back.usable_reader.metric, METRIC[[0, 2, 3, 4]])  # without the invalid probe
     described = json.loads((folder / "probes.json").read_text())
+    assert described["reader"] == {"interpolation": "gaussian", "neighbours": 3, "sight": True}
     assert described["convention"]["quantity"] == "radiance" and (described["count"], described["invalid"]) == (5, 1)
     assert sorted(p.name for p in folder.iterdir()) == ["probes.json", "probes.safetensors"]  # no temporary files
+
+
+def test_files_of_before_are_read_by_tetrahedra(tmp_path) -> None:
+    save_probes(tmp_path, ProbeRecord(some_probes()))
+    assert sorted(load_file(tmp_path / "probes.safetensors")) == ["position", "radiance", "valid"]
+    remove(tmp_path, "reader")
+    reader = load_probes(tmp_path).reader
+    assert (reader.interpolation, reader.metric, reader.sight) == ("tetrahedra", None, False)
 
 
 def test_convention_describes_the_basis_of_the_project() -> None:
@@ -77,9 +95,20 @@ def rewrite(folder: Path, **changes) -> None:
 
 
 def retensor(folder: Path, **tensors) -> None:
-    content = save({**load_file(folder / "probes.safetensors"), **tensors})
+    merged = {**load_file(folder / "probes.safetensors"), **tensors}
+    content = save({name: np.ascontiguousarray(tensor) for name, tensor in merged.items() if tensor is not None})
     (folder / "probes.safetensors").write_bytes(content)
     rewrite(folder, sha256=hashlib.sha256(content).hexdigest())
+
+
+def reread(folder: Path, **changes) -> None:
+    rewrite(folder, reader=json.loads((folder / "probes.json").read_text())["reader"] | changes)
+
+
+def remove(folder: Path, name: str) -> None:
+    described = json.loads((folder / "probes.json").read_text())
+    del described[name]
+    (folder / "probes.json").write_text(json.dumps(described))
 
 
 DAMAGE = {
@@ -107,6 +136,18 @@ DAMAGE = {
         "expected at least one",
     ),
     "huge": (lambda f: (f / "probes.json").write_bytes(b" " * (2**24 + 1)), "at most 16777216 are read"),
+    "footprints without metric": (lambda f: retensor(f, metric=None), "metric: expected one a probe with gaussian footprints"),
+    "tetrahedra with metric": (lambda f: reread(f, interpolation="tetrahedra"), "metric: .* none with tetrahedra"),
+    "unknown interpolation": (lambda f: reread(f, interpolation=["cubic"]), "expected tetrahedra or gaussian, got .'cubic'"),
+    "metric of other probes": (lambda f: retensor(f, metric=METRIC[:4]), "expected metrics of 5 probes, got 4"),
+    "metric not square": (lambda f: retensor(f, metric=METRIC[:, 0]), r"metric: expected shape .*, got \[5, 3\]"),
+    "metric not finite": (lambda f: retensor(f, metric=METRIC * np.inf), "metric: expected finite numbers"),
+    "no neighbours": (lambda f: reread(f, neighbours=0), "neighbours: expected a whole number > 0, got 0"),
+    "part of a neighbour": (lambda f: reread(f, neighbours=2.5), "neighbours: expected a whole number > 0, got 2.5"),
+    "unclear sight": (lambda f: reread(f, sight="yes"), "sight: expected True or False, got 'yes'"),
+    "metric without reader": (lambda f: remove(f, "reader"), r"probes\.json: 'reader' is missing"),
+    "reader in a list": (lambda f: rewrite(f, reader=["gaussian"]), "reader: expected a dictionary, got list"),
+    "reader in part": (lambda f: rewrite(f, reader={"interpolation": "gaussian"}), "reader: neighbours, sight missing"),
     "errors missing": (lambda f: rewrite(f, errors=None), "probe errors: expected a dictionary, got NoneType"),
 }
 
@@ -141,5 +182,7 @@ def test_records_check_themselves() -> None:
         ProbeRecord(some_probes(0))
     with pytest.raises(ValueError, match="probe scene: expected name and hash, got name"):
         ProbeRecord(some_probes(), {"name": "box"})
+    with pytest.raises(TypeError, match="probe reader: expected a ProbeReader, got str"):
+        ProbeRecord(some_probes(), reader="gaussian")  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="probe method: expected text, got int"):
         ProbeRecord(some_probes(), method=3)  # type: ignore[arg-type]

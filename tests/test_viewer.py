@@ -204,6 +204,7 @@ def test_lattice_fills_the_bounds_and_edges_join_neighbours():
     assert len(view.edges) >= 18, "a cube in tetrahedra has its 12 edges and a diagonal on each face"
     assert not len(ProbeView.of(np.zeros((0, 3))).edges)
     assert len(ProbeView.of(corners[:4]).edges) <= 6, "four in a plane"
+    assert not len(ProbeView.of(corners, interpolation="gaussian").edges)
 
 
 @pytest.mark.slow

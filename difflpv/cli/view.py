@@ -203,7 +203,8 @@ def _probes(args: argparse.Namespace, scene: Scene) -> ProbeView:
     if args.probes is not None:
         from difflpv.probes.probe_files import load_probes
 
-        return ProbeView.of(load_probes(args.probes).probes)
+        record = load_probes(args.probes)
+        return ProbeView.of(record.probes, interpolation=record.reader.interpolation)
     if args.probe_grid is None:
         return ProbeView.of(np.zeros((0, 3)))
     from data_gen.freespace import is_free

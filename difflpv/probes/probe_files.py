@@ -1,8 +1,9 @@
 """Light probes on disk: ``probes.json`` (what they are) beside ``probes.safetensors`` (their numbers).
 
-The tensors are ``position`` [n,3] float64 m, ``radiance`` [n,9,3] float64 W/m2 and ``valid`` [n] uint8. The record repeats the
-convention in words, so that a reader without this package can use the numbers; it also holds the checksum of the tensors, so
-that a pair from two different runs is refused.
+The tensors are ``position`` [n,3] float64 m, ``radiance`` [n,9,3] float64 W/m2, ``valid`` [n] uint8 and, where points read the
+probes by Gaussian footprints, ``metric`` [n,3,3] float64 1/m. ``reader`` in the record says how points read them
+(``ProbeReader``); files without it are read by tetrahedra. The record repeats the convention in words, so that a reader without
+this package can use the numbers; it also holds the checksum of the tensors, so that a pair from two different runs is refused.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from safetensors import SafetensorError
 import difflpv
 from difflpv.io.atomic import write_bytes, write_json
 from difflpv.probes.probe_set import COEFFS, ProbeSet
+from difflpv.probes.reader import ProbeReader
 
 __all__ = ["CONVENTION", "MAX_PROBES", "ProbeFileError", "ProbeRecord", "load_probes", "save_probes"]
 
@@ -30,7 +32,7 @@ MAX_PROBES = 2**20
 _FORMAT = 1
 _JSON, _TENSORS = "probes.json", "probes.safetensors"
 _MAX_JSON = 2**24  # bytes
-_MAX_TENSORS = MAX_PROBES * (3 + 3 * COEFFS) * 8 + MAX_PROBES + 2**16
+_MAX_TENSORS = MAX_PROBES * (3 + 3 * COEFFS + 9) * 8 + MAX_PROBES + 2**16
 
 CONVENTION: Mapping[str, Any] = MappingProxyType(
     {
@@ -63,6 +65,7 @@ class ProbeRecord:
         method: how they were placed; empty if unknown.
         errors: judged errors by name.
         provenance: further JSON values (command, seed, options, targets, seconds ...).
+        reader: how points read them, the invalid ones (which it leaves to its user to take out) included.
     """
 
     probes: ProbeSet
@@ -70,6 +73,7 @@ class ProbeRecord:
     method: str = ""
     errors: dict[str, float] = field(default_factory=dict)
     provenance: dict[str, Any] = field(default_factory=dict)
+    reader: ProbeReader = ProbeReader()
 
     def __post_init__(self) -> None:
         if not len(self.probes):
@@ -83,6 +87,16 @@ class ProbeRecord:
                 raise TypeError(f"probe {name}: expected a dictionary, got {type(getattr(self, name)).__name__}")
         if self.scene and not all(isinstance(self.scene.get(key), str) for key in ("name", "hash")):
             raise ValueError(f"probe scene: expected name and hash, got {', '.join(map(str, self.scene)) or 'nothing'}")
+        if not isinstance(self.reader, ProbeReader):
+            raise TypeError(f"probe reader: expected a ProbeReader, got {type(self.reader).__name__}")
+        if self.reader.metric is not None and len(self.reader.metric) != len(self.probes):
+            raise ValueError(f"probe reader: expected metrics of {len(self.probes)} probes, got {len(self.reader.metric)}")
+
+    @property
+    def usable_reader(self) -> ProbeReader:
+        """How points read ``probes.usable``."""
+        assert self.probes.valid is not None
+        return self.reader.kept(self.probes.valid)
 
 
 def save_probes(folder: str | Path, record: ProbeRecord) -> None:
@@ -100,6 +114,9 @@ def save_probes(folder: str | Path, record: ProbeRecord) -> None:
         "radiance": np.where(probes.valid[:, None, None], probes.radiance, np.nan_to_num(probes.radiance, posinf=0, neginf=0)),
         "valid": probes.valid.astype(np.uint8),
     }
+    reader = record.reader
+    if reader.metric is not None:
+        tensors["metric"] = np.ascontiguousarray(reader.metric)
     content = safetensors.numpy.save(tensors, metadata={"format": str(_FORMAT), "convention": json.dumps(dict(CONVENTION))})
     described = {
         "format": _FORMAT,
@@ -112,6 +129,7 @@ def save_probes(folder: str | Path, record: ProbeRecord) -> None:
         "method": record.method,
         "errors": record.errors,
         "provenance": record.provenance,
+        "reader": {"interpolation": reader.interpolation, "neighbours": reader.neighbours, "sight": reader.sight},
         "sha256": hashlib.sha256(content).hexdigest(),
     }
     json.dumps(described, allow_nan=False)  # before anything is on the disk
@@ -142,11 +160,23 @@ def load_probes(folder: str | Path) -> ProbeRecord:
     try:
         probes = ProbeSet(tensors["position"], tensors["radiance"], tensors["valid"].astype(bool))
         scene, method, errors, provenance = (described[name] for name in ("scene", "method", "errors", "provenance"))
-        return ProbeRecord(probes, scene, method, errors, provenance)
+        return ProbeRecord(probes, scene, method, errors, provenance, _reader(described, tensors.get("metric")))
     except KeyError as error:
         raise ProbeFileError(f"{path}: {error.args[0]!r} is missing") from None
     except (TypeError, ValueError) as error:
         raise ProbeFileError(f"{path}: {' '.join(str(error).split())}") from None
+
+
+def _reader(described: dict[str, Any], metric: np.ndarray | None) -> ProbeReader:
+    if "reader" not in described and metric is None:
+        return ProbeReader()
+    reader = described["reader"]
+    if not isinstance(reader, dict):
+        raise TypeError(f"reader: expected a dictionary, got {type(reader).__name__}")
+    missing = {"interpolation", "neighbours", "sight"} - set(reader)
+    if missing:
+        raise ValueError(f"reader: {', '.join(sorted(missing))} missing")
+    return ProbeReader(reader["interpolation"], metric, reader["neighbours"], reader["sight"])
 
 
 def _read_description(path: Path) -> dict[str, Any]:

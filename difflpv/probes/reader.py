@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -41,8 +41,28 @@ class ProbeReader:
             raise ValueError(f"interpolation: expected tetrahedra or gaussian, got {self.interpolation!r}")
         if (self.metric is not None) != (self.interpolation == "gaussian"):
             raise ValueError("metric: expected one a probe with gaussian footprints, none with tetrahedra")
-        if self.neighbours < 1:
-            raise ValueError(f"neighbours: expected a number > 0, got {self.neighbours}")
+        if self.metric is not None:
+            metric = np.array(self.metric, np.float64)
+            if metric.ndim != 3 or metric.shape[1:] != (3, 3) or not len(metric):
+                raise ValueError(f"metric: expected shape [n,3,3] with n > 0, got {list(metric.shape)}")
+            if not np.isfinite(metric).all():
+                raise ValueError("metric: expected finite numbers, got NaN or infinity")
+            metric.flags.writeable = False
+            object.__setattr__(self, "metric", metric)
+        if isinstance(self.neighbours, bool) or not isinstance(self.neighbours, int) or self.neighbours < 1:
+            raise ValueError(f"neighbours: expected a whole number > 0, got {self.neighbours!r}")
+        if not isinstance(self.sight, bool):
+            raise ValueError(f"sight: expected True or False, got {self.sight!r}")
+
+    def kept(self, index: np.ndarray) -> ProbeReader:
+        """The reader of some of the probes: those of ``index``, numbers or booleans [n]."""
+        return self if self.metric is None else replace(self, metric=self.metric[index])
+
+    @property
+    def described(self) -> str:
+        """In words, for people and files."""
+        how = "tetrahedra" if self.metric is None else f"Gaussian footprints of {self.neighbours} neighbours"
+        return f"{how}, weighted by sight" if self.sight else how
 
     def over(self, position: np.ndarray, scene: Scene, *, raycaster: Raycaster | None = None) -> Interpolation:
         """The interpolation over probes at ``position`` [n,3] m of ``scene``, whose walls ``sight`` looks at."""
@@ -50,5 +70,5 @@ class ProbeReader:
         if self.metric is None:
             inner = TetrahedralInterpolation(position)
         else:
-            inner = GaussianInterpolation(torch.as_tensor(self.metric), neighbours=self.neighbours)
+            inner = GaussianInterpolation(torch.tensor(self.metric), neighbours=self.neighbours)
         return VisibleInterpolation(inner, scene, raycaster=raycaster) if self.sight else inner

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from difflpv.probes.probe_set import ProbeSet
+from difflpv.probes.reader import InterpolationName
 from difflpv.probes.tetrahedra import Tetrahedra
 from difflpv.scene import Scene
 
@@ -19,7 +20,7 @@ class ProbeView:
 
     Attributes:
         position: [n,3] m.
-        edges: of the tetrahedra between them, [m,2,3] m.
+        edges: of the tetrahedra between them, [m,2,3] m; none where points read them otherwise.
         content: what they hold; None for places alone, which are shaded by the volume.
     """
 
@@ -28,11 +29,11 @@ class ProbeView:
     content: ProbeSet | None = None
 
     @classmethod
-    def of(cls, probes: ProbeSet | np.ndarray) -> ProbeView:
-        """Probes with their content, or their places [n,3] m alone."""
+    def of(cls, probes: ProbeSet | np.ndarray, *, interpolation: InterpolationName = "tetrahedra") -> ProbeView:
+        """Probes with their content, or their places [n,3] m alone, that points read by ``interpolation``."""
         position = probes.position if isinstance(probes, ProbeSet) else np.asarray(probes, np.float64).reshape(-1, 3)
         view = cls(position, np.zeros((0, 2, 3)), probes if isinstance(probes, ProbeSet) else None)
-        if not view.valid.any():
+        if not view.valid.any() or interpolation != "tetrahedra":
             return view
         pairs = Tetrahedra.of(position, valid=view.valid).edges
         return cls(position, position[pairs], view.content)

@@ -78,7 +78,13 @@ def run(args: argparse.Namespace) -> int:
                 "left_out": held_out.left_out,
                 "noise": held_out.noise,
                 "probes": [
-                    {"folder": probes.folder, "method": probes.record.method, "in_solids": inside, **judgement.to_json()}
+                    {
+                        "folder": probes.folder,
+                        "method": probes.record.method,
+                        "reader": probes.reader.described,
+                        "in_solids": inside,
+                        **judgement.to_json(),
+                    }
                     for probes, judgement, inside in found
                 ],
             }

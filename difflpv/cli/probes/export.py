@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from difflpv.cli.options import UsageError, add_output, positive
-from difflpv.cli.output import print_json
+from difflpv.cli.output import print_json, warn
 
 __all__ = ["add_parser", "run"]
 
@@ -60,11 +60,13 @@ def run(args: argparse.Namespace) -> int:
                 raise UsageError(f"--{name}: belongs to --format {format}, got --format {args.format}")
             options[name] = value
 
-    from difflpv.io.exports import export_probes
+    from difflpv.io.exports import export_probes, export_warnings
     from difflpv.probes.probe_files import load_probes
 
     record = load_probes(args.probes)
     files = export_probes(record, args.out, format=args.format, **options)
+    warnings = export_warnings(record, format=args.format)
+    warn(warnings)
     assert record.probes.valid is not None
     count, left = int(record.probes.valid.sum()), int((~record.probes.valid).sum())
     if args.json:
@@ -76,6 +78,7 @@ def run(args: argparse.Namespace) -> int:
                 "invalid": left,
                 "files": files,
                 "bytes": sum(file.stat().st_size for file in files),
+                "warnings": warnings,
             }
         )
         return 0

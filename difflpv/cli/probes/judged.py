@@ -42,14 +42,13 @@ class PlacedProbes:
             UsageError: they belong to another scene, or none is valid.
         """
         from difflpv.probes.probe_files import load_probes
-        from difflpv.probes.reader import ProbeReader
 
         record = load_probes(folder)
         if record.scene and record.scene["hash"] != scene.hash:
             raise UsageError(f"{folder}: probes of scene '{record.scene['name']}', not of this '{scene.name}'")
         if not len(record.probes.usable):
             raise UsageError(f"{folder}: none of its {len(record.probes)} probes is valid")
-        return cls(folder, record, np.array(record.probes.usable.position), ProbeReader())
+        return cls(folder, record, np.array(record.probes.usable.position), record.usable_reader)
 
     @property
     def seconds(self) -> float | None:

@@ -35,7 +35,7 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--targets", type=Path, metavar="DIR", help="draw errors at the points of these targets")
     parser.add_argument("--placed-by", type=Path, metavar="DIR", help="targets that placed them: their lights do not judge")
     parser.add_argument("--content", choices=CONTENTS, default="fitted", help="with --targets (default: %(default)s)")
-    parser.add_argument("--no-edges", action="store_true", help="leave the tetrahedra out")
+    parser.add_argument("--no-edges", action="store_true", help="leave the tetrahedra out, as for footprints")
     parser.add_argument("--workers", type=positive, default=1, metavar="N", help="processes that trace (default: %(default)s)")
     add_output(parser)
 
@@ -67,12 +67,13 @@ def run(args: argparse.Namespace) -> int:
         "method": placed.record.method,
         "probes": len(x),
         "invalid": len(placed.record.probes) - len(x),
+        "reader": placed.reader.described,
         "tetrahedra": len(tetrahedra.vertices),
         "cut_by_walls": int(cut.sum()),
         "apart": _apart(x),
         "errors": placed.record.errors,
     }
-    edges = None if args.no_edges else x[tetrahedra.edges]
+    edges = None if args.no_edges or placed.reader.interpolation != "tetrahedra" else x[tetrahedra.edges]
     pictures = [probe_picture(scene, placed.record.probes, edges=edges)]
     titles = [f"{scene.name}: {len(x)} probes{f', {placed.record.method}' if placed.record.method else ''}"]
     if args.targets is not None:
@@ -105,9 +106,10 @@ def _apart(position: np.ndarray) -> tuple[float, float] | None:
 
 
 def _text(told: dict[str, Any]) -> str:
+    read = f", read by {told['reader']}" if told["reader"] != "tetrahedra" else ""
     left = f" ({told['invalid']} invalid ones left out)" if told["invalid"] else ""
     lines = [
-        f"{told['probes']} probes{left}{', ' + told['method'] if told['method'] else ''}: "
+        f"{told['probes']} probes{left}{', ' + told['method'] if told['method'] else ''}{read}: "
         f"{told['tetrahedra']} tetrahedra between them, {told['cut_by_walls']} cut by a wall"
     ]
     if told["apart"] is not None:

@@ -8,7 +8,9 @@ Source: Ramamoorthi and Hanrahan, "An efficient representation for irradiance en
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -20,18 +22,36 @@ from difflpv.sh import lobe_factors
 
 __all__ = [
     "BASIS_SCALE",
+    "ENGINE_READS",
     "ExportError",
     "check_file",
     "convention_record",
     "make_folder",
+    "metric_records",
     "mirrored",
     "polynomial_coefficients",
+    "reader_record",
     "rounded",
     "usable_probes",
 ]
 
 BASIS_SCALE = np.sqrt(np.array([1, 3, 3, 3, 15, 15, 5 / 4, 15, 15 / 4]) / (4 * math.pi))
 """K_i with Y_i = K_i p_i and p = 1, y, z, x, xy, yz, 3z^2-1, xz, x^2-y^2 [9]."""
+ENGINE_READS: Mapping[str, str] = MappingProxyType(
+    {
+        "threejs": "three.js adds up all visible probes; your own code blends, with userData.metric and userData.reader",
+        "gltf": "glTF carries numbers alone; your own code blends, with extras.metric and extras.reader",
+        "filament": "Filament has one indirect light for the whole scene and blends nothing",
+        "unity": "Unity blends in tetrahedra of its own, without looking for walls",
+        "godot": "Godot blends in the tetrahedra of this export, without looking for walls",
+        "exr": "an atlas of images holds no weights; your own code blends",
+    }
+)
+"""How points read the probes of each format, in words."""
+_WEIGHTS = (
+    "d_j = |metric_j (x - p_j)|^2; of the neighbours of least d, w_j ~ exp(-(d_j - d_first) / 2) - exp(-(d_next - d_first) / 2)"
+    " + 1e-9, normalised, d_next being the least of those left out (without one: no such term); metric: three rows, 1/m"
+)
 # Sign of each polynomial under a reflection of one axis.
 _ODD = {"x": (3, 4, 7), "z": (2, 5, 7)}
 
@@ -65,7 +85,15 @@ def mirrored(probes: ProbeSet, axis: Literal["x", "z"]) -> ProbeSet:
 
 
 def convention_record(
-    record: ProbeRecord, engine: str, *, quantity: str, evaluate: str, axes: str, sources: tuple[str, ...], **more: Any
+    record: ProbeRecord,
+    engine: str,
+    *,
+    quantity: str,
+    evaluate: str,
+    axes: str,
+    sources: tuple[str, ...],
+    reads: str,
+    **more: Any,
 ) -> dict[str, Any]:
     """The record beside or inside an exported file.
 
@@ -76,6 +104,7 @@ def convention_record(
         evaluate: the engine's formula and what it yields.
         axes: handedness and up axis.
         sources: where the engine's convention is defined (addresses).
+        reads: how the engine lets points read the probes.
         more: what else matters for this format.
     """
     return {
@@ -87,12 +116,30 @@ def convention_record(
         "direction": "lobes point from the probe toward the incoming light; evaluated at the surface's outward normal",
         "color": "linear RGB",
         "length": "m",
+        "interpolation": {"made_for": record.reader.described, "engine": reads},
         "sources": list(sources),
         **more,
         "scene": record.scene,
         "method": record.method,
         "errors": record.errors,
     }
+
+
+def reader_record(record: ProbeRecord) -> dict[str, Any]:
+    """How points are to read the probes, for formats that have a place for it."""
+    reader = record.reader
+    described: dict[str, Any] = {"interpolation": reader.interpolation, "sight": reader.sight}
+    if reader.metric is not None:
+        described |= {"neighbours": reader.neighbours, "weights": _WEIGHTS}
+    return described
+
+
+def metric_records(record: ProbeRecord) -> list[dict[str, Any]]:
+    """For each valid probe ``{"metric": 3x3}`` 1/m, or nothing where points read tetrahedra."""
+    reader = record.usable_reader
+    if reader.metric is None:
+        return [{} for _ in range(len(record.probes.usable))]
+    return [{"metric": metric} for metric in rounded(reader.metric)]
 
 
 def rounded(values: np.ndarray) -> list[Any]:

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from difflpv.io.atomic import write_json
-from difflpv.io.exports.convention import ExportError, check_file, convention_record, rounded, usable_probes
+from difflpv.io.exports.convention import ENGINE_READS, ExportError, check_file, convention_record, rounded, usable_probes
 from difflpv.io.exr import write_exr
 from difflpv.probes.probe_files import ProbeRecord
 from difflpv.probes.probe_set import irradiance_of
@@ -72,6 +72,7 @@ def export_exr(
         "direction = (sin lon cos lat, sin lat, cos lon cos lat)",
         axes="right-handed, y up",
         sources=_SOURCES,
+        reads=ENGINE_READS["exr"],
         scale=1.0,
         layout="tile k of width W, height H at column (k mod columns), row (k div columns), from the top left; no gutter",
         tile=[2 * height, height],

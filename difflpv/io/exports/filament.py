@@ -14,6 +14,7 @@ from pathlib import Path
 
 from difflpv.io.atomic import write_json, write_text
 from difflpv.io.exports.convention import (
+    ENGINE_READS,
     convention_record,
     make_folder,
     polynomial_coefficients,
@@ -55,6 +56,7 @@ def export_filament(record: ProbeRecord, out: Path) -> list[Path]:
         evaluate="c0 + c1 y + c2 z + c3 x + c4 yx + c5 yz + c6 (3z^2-1) + c7 zx + c8 (x^2-y^2) of the world normal is E/pi",
         axes="right-handed, y up",
         sources=_SOURCES,
+        reads=ENGINE_READS["filament"],
         scale="c_i = L_i K_i A_l / pi; with IndirectLight::Builder::intensity(1) no further factor",
         order="l(l+1)+m, no Condon-Shortley phase",
     )

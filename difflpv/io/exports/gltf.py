@@ -9,7 +9,15 @@ from __future__ import annotations
 from pathlib import Path
 
 from difflpv.io.atomic import write_json
-from difflpv.io.exports.convention import check_file, convention_record, rounded, usable_probes
+from difflpv.io.exports.convention import (
+    ENGINE_READS,
+    check_file,
+    convention_record,
+    metric_records,
+    reader_record,
+    rounded,
+    usable_probes,
+)
 from difflpv.probes.probe_files import CONVENTION, ProbeRecord
 
 __all__ = ["export_gltf"]
@@ -28,15 +36,16 @@ def export_gltf(record: ProbeRecord, out: Path) -> list[Path]:
         evaluate=CONVENTION["irradiance"],
         axes="right-handed, y up",
         sources=_SOURCES,
+        reads=ENGINE_READS["gltf"],
         scale=1.0,
         basis=f"{CONVENTION['basis']}, index {CONVENTION['index']}, polynomials {', '.join(CONVENTION['polynomials'])}",
     )
     count = len(probes)
-    nodes: list[dict[str, object]] = [
-        {"name": "light_probes", "children": list(range(1, count + 1)), "extras": {"convention": convention}}
-    ]
+    extras = {"convention": convention, "reader": reader_record(record)}
+    nodes: list[dict[str, object]] = [{"name": "light_probes", "children": list(range(1, count + 1)), "extras": extras}]
+    own = metric_records(record)
     for k, (position, radiance) in enumerate(zip(rounded(probes.position), rounded(probes.radiance), strict=True)):
-        nodes.append({"name": f"probe_{k:04d}", "translation": position, "extras": {"radiance_sh": radiance}})
+        nodes.append({"name": f"probe_{k:04d}", "translation": position, "extras": {"radiance_sh": radiance, **own[k]}})
     document = {
         "asset": {"version": "2.0", "generator": "difflpv"},
         "scene": 0,

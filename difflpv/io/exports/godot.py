@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from difflpv.io.atomic import write_json, write_text
-from difflpv.io.exports.convention import ExportError, convention_record, make_folder, rounded, usable_probes
+from difflpv.io.exports.convention import ENGINE_READS, ExportError, convention_record, make_folder, rounded, usable_probes
 from difflpv.io.exports.plane_tree import EMPTY, plane_tree
 from difflpv.probes.probe_files import ProbeRecord
 from difflpv.probes.tetrahedra import box_corners
@@ -58,6 +58,7 @@ def export_godot(record: ProbeRecord, out: Path) -> list[Path]:
         evaluate="sum over i of A_l c_i Y_i(n), A = pi, 2 pi/3, pi/4, as the scene shader does, is E/pi",
         axes="right-handed, y up",
         sources=_SOURCES,
+        reads=ENGINE_READS["godot"],
         scale="c_i = L_i / pi",
         box_probes="the last 8 points are the corners of the box, each with the content of the nearest probe",
         tree=f"plane n.p = d a node, children over and under; -1-k is tetrahedron k, {EMPTY} none",

@@ -13,7 +13,15 @@ import uuid
 from pathlib import Path
 
 from difflpv.io.atomic import write_json
-from difflpv.io.exports.convention import check_file, convention_record, rounded, usable_probes
+from difflpv.io.exports.convention import (
+    ENGINE_READS,
+    check_file,
+    convention_record,
+    metric_records,
+    reader_record,
+    rounded,
+    usable_probes,
+)
 from difflpv.probes.probe_files import ProbeRecord
 
 __all__ = ["export_threejs"]
@@ -35,10 +43,12 @@ def export_threejs(record: ProbeRecord, out: Path) -> list[Path]:
         evaluate="sh.getIrradianceAt(n) and the shader's shGetIrradianceAt(n) give irradiance E(n) [W/m2]",
         axes="right-handed, y up",
         sources=_SOURCES,
+        reads=ENGINE_READS["threejs"],
         scale=1.0,
         visible="false: three.js adds up all visible probes of a scene; show one, or blend with sh.addScaledSH",
     )
-    children = []
+    children: list[dict[str, object]] = []
+    own = metric_records(record)
     for k, (position, sh) in enumerate(zip(rounded(probes.position), rounded(probes.radiance.reshape(-1, 27)), strict=True)):
         children.append(
             {
@@ -51,6 +61,7 @@ def export_threejs(record: ProbeRecord, out: Path) -> list[Path]:
                 "color": 0xFFFFFF,
                 "intensity": 1,
                 "sh": sh,
+                "userData": own[k],
             }
         )
     group = {
@@ -59,7 +70,7 @@ def export_threejs(record: ProbeRecord, out: Path) -> list[Path]:
         "name": "light_probes",
         "layers": 1,
         "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1],
-        "userData": {"convention": convention},
+        "userData": {"convention": convention, "reader": reader_record(record)},
         "children": children,
     }
     write_json(out, {"metadata": {"version": 4.6, "type": "Object", "generator": "difflpv"}, "object": group})

@@ -15,6 +15,7 @@ from typing import Literal
 
 from difflpv.io.atomic import write_json, write_text
 from difflpv.io.exports.convention import (
+    ENGINE_READS,
     convention_record,
     make_folder,
     mirrored,
@@ -52,6 +53,7 @@ def export_unity(record: ProbeRecord, out: Path, *, mirror: Literal["x", "z"] = 
         evaluate="c0 + c1 y + c2 z + c3 x + c4 xy + c5 yz + c6 (3z^2-1) + c7 xz + c8 (x^2-y^2), as Evaluate(n), is E/pi",
         axes=f"left-handed, y up; {mirror} is minus the {mirror} of the right-handed scene",
         sources=_SOURCES,
+        reads=ENGINE_READS["unity"],
         scale="c_i = L_i K_i A_l / pi",
         layout="positions: 3 numbers a probe; coefficients: 27 numbers a probe, i after i, r g b",
     )
