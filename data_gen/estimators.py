@@ -109,6 +109,7 @@ def probe_block(
     seed: int,
     address: tuple[int, ...],
     round: int = 0,
+    replicates: int = REPLICATES,
 ) -> np.ndarray:
     """Incident radiance of a few free-space points as SH coefficients c_i = integral of L_in(w) Y_i(w) dw.
 
@@ -122,13 +123,14 @@ def probe_block(
         seed: seed of the run.
         address: integers that name these entities.
         round: which part of each replicate's samples.
+        replicates: independent estimates of each probe.
 
     Returns:
-        Coefficients [W/m2], shape [REPLICATES, n, components, 9, 3].
+        Coefficients [W/m2], shape [replicates, n, components, 9, 3].
     """
     n = len(positions)
-    stream = SampleStream(seed, *address, groups=n * REPLICATES, samples=samples, round=round)
-    origins = np.repeat(np.asarray(positions.T, np.float32), REPLICATES * samples, 1)
+    stream = SampleStream(seed, *address, groups=n * replicates, samples=samples, round=round)
+    origins = np.repeat(np.asarray(positions.T, np.float32), replicates * samples, 1)
     directions = uniform_sphere(stream.uniform(0, 2))
     pdf = np.full(origins.shape[1], uniform_sphere_pdf(), np.float32)
     buckets = tracer.radiance(origins, directions, pdf, stream, components.bucket_of_bounce, dimension=4)
@@ -143,12 +145,12 @@ def probe_block(
         seen = seen[tracer.visible(origins[:, seen], light.direction[:, seen], light.distance[seen])]
         lit[:, seen] = light.radiance[:, seen] * (power_weight(light.pdf[seen], pdf[seen]) / light.pdf[seen])
         light_basis = np.ascontiguousarray(sh_basis(light.direction.T, 2).T)
-    means = np.empty((REPLICATES, n, len(components.names), 9, 3))
+    means = np.empty((replicates, n, len(components.names), 9, 3))
     for i in range(9):
         projected = buckets * basis[i]
         if direct >= 0:
             projected[direct] += lit * light_basis[i]
-        means[:, :, :, i] = _by_replicate(projected, components, n, samples)
+        means[:, :, :, i] = _by_replicate(projected, components, n, samples, replicates)
     if direct >= 0:
         exact = np.asarray(positions.T, np.float64)
         for index in range(len(tracer.emitters.deltas)):

@@ -1,21 +1,23 @@
-"""Irradiance of receivers by a few paths each, in one process or several that wait for work: a peer to compare with.
+"""Irradiance of receivers, or radiance of probes, by a few paths each, in processes that wait for work: peers to compare with.
 
 Targets with their standard errors are ``data_gen.targets``.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
+from typing import Any
 
 import numpy as np
 
 from data_gen.components import Components
-from data_gen.estimators import irradiance_block
+from data_gen.estimators import irradiance_block, probe_block
 from data_gen.pathtracer import PathTracer
 from data_gen.workers import start_pool
 from difflpv.scene import Scene
 
-__all__ = ["PathPool", "trace_paths"]
+__all__ = ["PathPool", "trace_paths", "trace_probe_paths"]
 
 _PATHS_PER_CALL = 1 << 16
 _tracer: PathTracer | None = None  # of a worker process
@@ -36,6 +38,17 @@ def trace_paths(
     return np.concatenate(parts) if parts else np.zeros((0, 3))
 
 
+def trace_probe_paths(tracer: PathTracer, position: np.ndarray, component: str, *, samples: int, seed: int) -> np.ndarray:
+    """Radiance SH toward the incoming light [n,9,3] W/m2 of probes [n,3] m by so many paths each, a power of two."""
+    wanted, parts = Components.of([component]), []
+    step = max(1, _PATHS_PER_CALL // samples)
+    for begin in range(0, len(position), step):
+        rows = position[begin : begin + step]
+        means = probe_block(tracer, rows, wanted, samples=samples, seed=seed, address=(begin,), replicates=1)
+        parts.append(means[0, :, 0])
+    return np.concatenate(parts) if parts else np.zeros((0, 9, 3))
+
+
 class PathPool:
     """Path tracers of one scene, one per process; with a single worker no process is started."""
 
@@ -48,12 +61,21 @@ class PathPool:
 
     def trace(self, position: np.ndarray, normal: np.ndarray, component: str, *, samples: int, seed: int) -> np.ndarray:
         """As ``trace_paths``; the bits depend on the number of workers."""
+        return self._share(trace_paths, (position, normal), component, samples, seed)
+
+    def trace_probes(self, position: np.ndarray, component: str, *, samples: int, seed: int) -> np.ndarray:
+        """As ``trace_probe_paths``; the bits depend on the number of workers."""
+        return self._share(trace_probe_paths, (position,), component, samples, seed)
+
+    def _share(
+        self, trace: Callable[..., np.ndarray], rows: tuple[np.ndarray, ...], component: str, samples: int, seed: int
+    ) -> np.ndarray:
         if self._own is not None:
-            return trace_paths(self._own, position, normal, component, samples=samples, seed=seed)
+            return trace(self._own, *rows, component, samples=samples, seed=seed)
         assert self._pool is not None
-        bounds = np.linspace(0, len(position), self.workers + 1).astype(int)
+        bounds = np.linspace(0, len(rows[0]), self.workers + 1).astype(int)
         waiting = [
-            self._pool.submit(_work, position[a:b], normal[a:b], component, samples, seed + i)
+            self._pool.submit(_work, trace, [part[a:b] for part in rows], component, samples, seed + i)
             for i, (a, b) in enumerate(zip(bounds[:-1], bounds[1:], strict=True))
         ]
         return np.concatenate([w.result() for w in waiting])
@@ -69,6 +91,6 @@ def _start(scene: Scene) -> None:
     _tracer = PathTracer(scene)
 
 
-def _work(position: np.ndarray, normal: np.ndarray, component: str, samples: int, seed: int) -> np.ndarray:
+def _work(trace: Callable[..., np.ndarray], rows: list[Any], component: str, samples: int, seed: int) -> np.ndarray:
     assert _tracer is not None
-    return trace_paths(_tracer, position, normal, component, samples=samples, seed=seed)
+    return trace(_tracer, *rows, component, samples=samples, seed=seed)

@@ -27,7 +27,7 @@ from difflpv.cli import main
 from difflpv.stencil_files import learned_stencil
 
 TINY = BenchSettings(receivers=40, spp=64, image_width=16, image_spp=32, cell_spp=32, repeats=1, patience=0.01)
-NAMES = ["constant", "LPV as published", "learned_9x6, 8 cells, 8 steps", "path tracer, 4"]
+NAMES = ["constant", "LPV as published", "learned_9x6, 8 cells, 8 steps", "path tracer, 4", "probes 64, path-traced"]
 
 
 def point(name, family, error, seconds, receivers=100):
@@ -60,6 +60,11 @@ def test_the_verdict_says_what_the_scene_says():
     assert "1 learned rung" in said and "so do, as published: HOLPV as published" in said
     assert "none as published" in front_verdict([constant, learned], ["HOLPV as published"])
     assert "tracing paths beats them all" in front_verdict([constant, learned, traced], [])
+    probes = point("probes 64, LPV-lit", "LPV-lit probes", 0.19, 0.05)
+    said = front_verdict([constant, learned, traced, probes], [])
+    assert "beats them all" in said and "On the front" not in said  # one sample is faster and nearer
+    said = front_verdict([constant, learned, probes], [])
+    assert "1 learned rung" in said and said.endswith("On the front of all methods: probes 64, LPV-lit.")
     assert "No learned rung" in front_verdict([constant, old], [])
     assert "No volume solve beats" in front_verdict([constant, point("LPV", "LPV", 2, 1)], [])
 
@@ -111,8 +116,9 @@ def test_a_run_is_not_repeated_and_writes_what_it_says(tmp_path):
     assert not any("measuring" in line for line in told)
     assert again.points == first.points and {p.scene for p in first.points} == {"diagonal/direct"}
     more = run_bench(tmp_path, progress=told.append, **{**options, "names": [*NAMES, "path tracer, 1"]})
-    assert any("measuring 1 of 5" in line for line in told) and more.points[:4] == first.points[:4]
-    assert len((tmp_path / "points.csv").read_text().splitlines()) == 1 + len(more.points)
+    assert any("measuring 1 of 6" in line for line in told) and more.points[:5] == first.points
+    lines = (tmp_path / "points.csv").read_text().splitlines()
+    assert len(lines) == 1 + len(more.points) and any(line.count("traced probes") for line in lines)
     picture = next(p for p in first.points if p.name == "learned_9x6, 8 cells, 8 steps")
     assert 0 < picture.ssim < 0.5 and (picture.flip is None or 0 < picture.flip < 1)
 
@@ -134,7 +140,8 @@ def test_command_writes_tables_charts_and_an_interactive_page(tmp_path, capsys):
     chart = "speed/line_diagonal_direct_floor.png"
     assert chart in text and (page.parent / chart).is_file()
     assert "GTX 460" in text and "GTX 480" in text and "speed/diagonal_direct.png" in text
-    assert (out / "charts" / "diagonal_direct.svg").read_text().lstrip().startswith("<?xml")
+    drawn = (out / "charts" / "diagonal_direct.svg").read_text()
+    assert drawn.lstrip().startswith("<?xml") and "traced probes" in drawn
     html = (out / "charts" / "bench.html").read_text()
     data = json.loads(re.search(r'type="application/json">(.*?)</script>', html)[1])
     assert len(data["scenes"]["diagonal/direct"]["points"]) == len(NAMES)

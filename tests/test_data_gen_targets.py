@@ -270,6 +270,7 @@ def test_workers_leave_ctrl_c_to_their_parent():
         assert pool._pool.submit(signal.getsignal, signal.SIGINT).result() == signal.SIG_IGN
         x = np.array([[0.0, 1.0, 0.0], [0.5, 1.0, 0.0]])
         assert pool.trace(x, np.array([[0, 1.0, 0]] * 2), "direct", samples=4, seed=0).shape == (2, 3)
+        assert pool.trace_probes(x, "direct", samples=4, seed=0).shape == (2, 9, 3)
     finally:
         pool.close()
 

@@ -13,9 +13,16 @@ from difflpv.config import LpvConfig
 
 __all__ = ["FAMILIES", "LADDER", "Configuration", "Family", "Kind", "chosen"]
 
-Kind = Literal["constant", "volume", "floor", "paths", "mitsuba"]
-Family = Literal["constant", "LPV", "HOLPV", "learned", "floor", "path tracer", "Mitsuba 3"]
+Kind = Literal["constant", "volume", "floor", "paths", "mitsuba", "traced probes", "lit probes"]
+Family = Literal["constant", "LPV", "HOLPV", "learned", "floor", "path tracer", "Mitsuba 3", "traced probes", "LPV-lit probes"]
 FAMILIES: tuple[str, ...] = get_args(Family)
+
+
+_WANTED: dict[str, tuple[Kind, ...]] = {
+    "config": ("volume", "floor", "lit probes"),
+    "samples": ("paths", "mitsuba", "traced probes"),
+    "probes": ("traced probes", "lit probes"),
+}
 
 
 @dataclass(frozen=True)
@@ -26,13 +33,14 @@ class Configuration:
         name: unique.
         kind: how it is solved.
         family: what it is drawn and counted with.
-        config: the solve, for "volume" and "floor" (which only reads by its lookup).
+        config: the solve, for "volume", "lit probes" and "floor" (which only reads by its lookup).
         cells: along x of the scene's grid; None for the scene's own.
         surface_samples: lit surface samples that start a bounce of area lights.
         area_samples: samples per area light.
         learn: what is tuned to the scene before it is measured, on other receivers than those that judge
             (``difflpv.learnables``); empty for what is taken as it comes.
-        samples: paths per receiver, for "paths" and "mitsuba".
+        samples: paths per receiver for "paths" and "mitsuba", per probe for "traced probes".
+        probes: how many at most, on a uniform grid in free space, for "traced probes" and "lit probes".
         published: as in a publication, nothing of this project in it.
         quick: part of a quick run.
     """
@@ -46,6 +54,7 @@ class Configuration:
     area_samples: int = 64
     learn: tuple[str, ...] = ()
     samples: int | None = None
+    probes: int | None = None
     published: bool = False
     quick: bool = False
 
@@ -53,10 +62,14 @@ class Configuration:
         for name, choices in (("kind", get_args(Kind)), ("family", FAMILIES)):
             if getattr(self, name) not in choices:
                 raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {getattr(self, name)!r}")
-        if (self.config is not None) != (self.kind in ("volume", "floor")):
-            raise ValueError(f"config: expected one for 'volume' and 'floor' only, '{self.name}' is of kind '{self.kind}'")
-        if (self.samples is not None) != (self.kind in ("paths", "mitsuba")):
-            raise ValueError(f"samples: expected a number for 'paths' and 'mitsuba' only, '{self.name}' is '{self.kind}'")
+        for name, kinds in _WANTED.items():
+            if (getattr(self, name) is not None) != (self.kind in kinds):
+                only = " and ".join(f"'{kind}'" for kind in kinds)
+                raise ValueError(f"{name}: expected for {only} only, '{self.name}' is of kind '{self.kind}'")
+        if self.kind == "lit probes" and self.config is not None and self.config.stencil.l_max < 2:
+            raise ValueError(f"config: expected 9 coefficients or more for probes, '{self.name}' has {self.config.method}")
+        if self.probes is not None and self.probes < 1:
+            raise ValueError(f"probes: expected at least 1, got {self.probes}")
         if self.cells is not None and self.cells < 3:
             raise ValueError(f"cells: expected at least 3, got {self.cells}")
         if self.samples is not None and (self.samples < 1 or self.samples & (self.samples - 1)):
@@ -64,7 +77,7 @@ class Configuration:
 
     def to_json(self) -> dict[str, Any]:
         """Plain values: what decides the numbers."""
-        named = ("name", "kind", "family", "cells", "surface_samples", "area_samples", "samples", "published")
+        named = ("name", "kind", "family", "cells", "surface_samples", "area_samples", "samples", "probes", "published")
         values = {name: getattr(self, name) for name in named}
         return {**values, "learn": list(self.learn), "config": self.config.to_json() if self.config else None}
 
@@ -120,6 +133,12 @@ LADDER: tuple[Configuration, ...] = (
         Configuration(f"Mitsuba 3, {n}", "mitsuba", "Mitsuba 3", samples=n, quick=n in (1, 4, 16, 64))
         for n in (1, 4, 16, 64, 256)
     ),
+    *(
+        Configuration(f"probes {n}, path-traced", "traced probes", "traced probes", samples=256, probes=n, quick=n == 64)
+        for n in (64, 256)
+    ),
+    Configuration("probes 64, LPV-lit, 16 cells", "lit probes", "LPV-lit probes", _learned(steps=16), 16, **_FEW, probes=64),
+    Configuration("probes 256, LPV-lit", "lit probes", "LPV-lit probes", _learned(), probes=256),
 )
 
 

@@ -19,6 +19,7 @@ from data_gen.few_paths import PathPool
 from difflpv.bench.configuration import Configuration
 from difflpv.bench.images import BenchView, image_errors
 from difflpv.bench.mitsuba_peer import MitsubaRun
+from difflpv.bench.probes import LitProbes, ProbeRun, TracedProbes
 from difflpv.bench.scenes import BenchScene
 from difflpv.bench.timing import Timing, interleaved, peak_bytes
 from difflpv.bench.tracers import ConstantRun, PathRun
@@ -123,7 +124,7 @@ def prepare(
 
     Raises:
         ImportError: a library that this configuration needs is not there.
-        ValueError: no receivers to tune on, or a light that Mitsuba has not.
+        ValueError: no receivers to tune on, a light that Mitsuba has not, or no free space for probes.
     """
     if configuration.kind == "constant":
         return ConstantRun(configuration, scene)
@@ -135,6 +136,10 @@ def prepare(
         return PathRun(configuration, scene, pool or PathPool(scene.scene))
     if configuration.kind == "mitsuba":
         return MitsubaRun(configuration, scene)
+    if configuration.kind == "traced probes":
+        return TracedProbes(configuration, scene, pool or PathPool(scene.scene))
+    if configuration.kind == "lit probes":
+        return LitProbes(configuration, scene, tuning=tuning)
     raise ValueError(f"configuration '{configuration.name}': no way to solve kind '{configuration.kind}'")
 
 
@@ -186,9 +191,9 @@ def measure(
             found[c.name] |= image_errors(run, view, direct=scene.component == "direct")
         if c.kind not in ("constant", "floor"):
             calls[f"solve {c.name}"] = run.solve
-        if isinstance(run, VolumeRun):
+        if isinstance(run, VolumeRun | ProbeRun):
             calls[f"lookup {c.name}"] = lambda run=run, solved=solved: run.lookup(solved)  # type: ignore[misc]
-            if gradients and c.kind == "volume":
+            if gradients and isinstance(run, VolumeRun) and c.kind == "volume":
                 calls[f"both {c.name}"] = run.both
     times = interleaved(calls, repeats, patience=patience)
     points = []

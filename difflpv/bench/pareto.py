@@ -8,6 +8,8 @@ from difflpv.bench.measure import Point
 
 __all__ = ["front_verdict", "pareto_front", "volume_solves"]
 
+_PROBES = ("traced probes", "LPV-lit probes")
+
 
 def pareto_front(points: Sequence[Point]) -> list[Point]:
     """Points that no other beats in both error and time, the fastest first; the constant, which costs nothing, bounds them.
@@ -24,12 +26,12 @@ def pareto_front(points: Sequence[Point]) -> list[Point]:
 
 
 def volume_solves(points: Sequence[Point]) -> list[Point]:
-    """Those that solve a volume, and the constant that they have to beat."""
+    """Those that solve a volume and read it, and the constant that they have to beat."""
     return [p for p in points if p.family in ("constant", "LPV", "HOLPV", "learned")]
 
 
 def front_verdict(points: Sequence[Point], published: Sequence[str]) -> str:
-    """What a scene says, in a sentence: whose volume solves lie on their front, and whether tracing paths beats them all.
+    """What a scene says: whose volume solves lie on their front, whether tracing paths beats them all, which probes do best.
 
     Args:
         points: of one scene and component.
@@ -47,7 +49,7 @@ def front_verdict(points: Sequence[Point], published: Sequence[str]) -> str:
     ]
     if not learned:
         parts = [f"No learned rung lies on the Pareto front; there lie {', '.join(p.name for p in front)}."]
-    everyone = pareto_front(points)
+    everyone = pareto_front([p for p in points if p.family not in _PROBES])
     traced = [p for p in everyone if p.family in ("path tracer", "Mitsuba 3")]
     kept = [p for p in everyone if p.family == "learned"]
     count = max(p.receivers for p in points)
@@ -55,6 +57,8 @@ def front_verdict(points: Sequence[Point], published: Sequence[str]) -> str:
         parts.append(f"For these {count} receivers tracing paths beats them all.")
     elif traced:
         parts.append(f"With path tracers in the race, {_rungs(len(kept), 'stay')} on it for these {count} receivers.")
+    if probes := [p.name for p in pareto_front(points) if p.family in _PROBES]:
+        parts.append(f"On the front of all methods: {'; '.join(probes)}.")
     return " ".join(parts)
 
 

@@ -9,9 +9,10 @@ from difflpv.bench.configuration import Configuration
 from difflpv.bench.scenes import BenchScene
 from difflpv.evaluate import predict_constant
 
-__all__ = ["ConstantRun", "PathRun"]
+__all__ = ["PEER_SEED", "ConstantRun", "PathRun"]
 
-_SEED = 1_000_003  # added to that of the truth: its paths must not judge themselves
+PEER_SEED = 1_000_003
+"""Added to the seed of the truth: its paths must not judge themselves."""
 
 
 class ConstantRun:
@@ -54,5 +55,5 @@ class PathRun:
 
     def predict(self, position: np.ndarray, normal: np.ndarray) -> np.ndarray:
         """Trace other receivers."""
-        seed = self.bench.seed + _SEED
+        seed = self.bench.seed + PEER_SEED
         return self.pool.trace(position, normal, self.bench.component, samples=self.samples, seed=seed)

@@ -8,13 +8,17 @@ dynamic global illumination for production", JCGT 2021).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
 from difflpv.placement.journal import Journal
 from difflpv.placement.task import Placement, PlacementTask, Progress
 
-__all__ = ["SPREADS", "UniformGrid", "first_grid", "move_into_free_space", "place_grid", "place_grid_moved", "uniform_grids"]
+__all__ = [
+    "SPREADS", "FreeSpace", "UniformGrid", "first_grid", "move_into_free_space", "place_grid", "place_grid_moved",
+    "uniform_grids",
+]  # fmt: skip
 
 SPREADS = (1.0, 1.1, 1.2, 1.3)
 """Scales about the centre that are tried: probes at the centres of cells leave half a cell at the border uncovered."""
@@ -22,6 +26,17 @@ SPREADS = (1.0, 1.1, 1.2, 1.3)
 MOVE_LIMIT = 0.45
 _SHAPES = 3  # as many shapes are tried by their training error
 _REFINEMENTS = 8
+
+
+class FreeSpace(Protocol):
+    """Where probes may be: all that a grid asks of a ``PlacementTask``."""
+
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest corner [3] m of the box that is filled."""
+
+    def in_free_space(self, position: np.ndarray, margin: float = 0.0) -> np.ndarray:
+        """True for positions [n,3] m at least ``margin`` m off every surface and in no solid."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,14 +50,14 @@ class UniformGrid:
 
 
 def uniform_grids(
-    task: PlacementTask, count: int, spread: float = 1.0, *, margin: float | None = None
+    task: FreeSpace, count: int, spread: float = 1.0, *, margin: float | None = None
 ) -> list[UniformGrid]:
     """The finest grids of near-cubic spacing of which at most ``count`` probes lie in free space, best proportions first.
 
     Where probes fall into solids, a finer grid takes the place of the one with ``count`` probes, so that none is wasted.
 
     Args:
-        task: its points span the grid's box.
+        task: says what box to fill (that of a placement's points), and where free space is.
         count: probes at most.
         spread: scale about the centre of the box.
         margin: if given, probes in solids are first moved out of them, this share of the smallest spacing off the surface.
@@ -85,7 +100,7 @@ def _grid(low: np.ndarray, high: np.ndarray, shape: tuple[int, int, int], spread
     return UniformGrid(np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3), shape, spacing, spread)
 
 
-def _free(task: PlacementTask, grid: UniformGrid, margin: float | None) -> UniformGrid:
+def _free(task: FreeSpace, grid: UniformGrid, margin: float | None) -> UniformGrid:
     position = grid.position
     if margin is not None:
         position = move_into_free_space(
@@ -111,7 +126,7 @@ def _shapes(extent: np.ndarray, count: int) -> list[tuple[int, int, int]]:
 
 
 def move_into_free_space(
-    task: PlacementTask, position: np.ndarray, limit: np.ndarray, *, margin: float = 0.0, steps: int = 4
+    task: FreeSpace, position: np.ndarray, limit: np.ndarray, *, margin: float = 0.0, steps: int = 4
 ) -> np.ndarray:
     """Move positions [n,3] m that are not in free space the shortest way into it, at most ``limit`` [3] m along each axis.
 

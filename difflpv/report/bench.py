@@ -18,9 +18,11 @@ __all__ = [
 
 FAMILY_COLORS = {
     "constant": "#777777", "LPV": "#e69f00", "HOLPV": "#d55e00", "learned": "#00795a", "floor": "#333333",
-    "path tracer": "#56b4e9", "Mitsuba 3": "#0057a3",
+    "path tracer": "#56b4e9", "Mitsuba 3": "#0057a3", "traced probes": "#cc79a7", "LPV-lit probes": "#7a3e9d",
 }  # fmt: skip
-_MARKERS = {"LPV": "s", "HOLPV": "D", "learned": "o", "path tracer": "^", "Mitsuba 3": "v"}
+_MARKERS = {
+    "LPV": "s", "HOLPV": "D", "learned": "o", "path tracer": "^", "Mitsuba 3": "v", "traced probes": ">", "LPV-lit probes": "p",
+}  # fmt: skip
 _DPI = 75
 _STEEP = 20  # peak over median of a line that needs a logarithmic axis
 
