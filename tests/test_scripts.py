@@ -9,6 +9,7 @@ from data_gen.targets import make_targets
 from difflpv.io import load_scene
 from difflpv.lights import load_light_sets
 from difflpv.pipeline import Lpv
+from difflpv.probes.probe_files import load_probes
 
 SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
 
@@ -47,3 +48,13 @@ def test_training_loop(tmp_path, capsys):
     losses = load_script("training_loop").main(["cornell", str(tmp_path / "targets"), *arguments])
     assert len(losses) == 5 and losses[-1] < losses[0]
     assert Lpv.load(tmp_path / "model").values()["propagation_steps"].shape == (4,)
+
+
+@pytest.mark.slow
+def test_place_probes(tmp_path, capsys):
+    arguments = ["--count", "12", "--steps", "30", "--points", "240", "--spp", "128", "--cells", "8"]
+    found = load_script("place_probes").main(["--out", str(tmp_path), *arguments])
+    assert "gradient / grid: 0." in capsys.readouterr().out
+    assert found["gradient"].error < found["grid"].error and found["gradient"].count <= 12
+    record = load_probes(tmp_path / "gradient")
+    assert len(record.probes) == found["gradient"].count and record.method == "gradient"

@@ -9,14 +9,14 @@ from typing import Any
 
 __all__ = ["SUBCOMMANDS", "add_parser"]
 
-SUBCOMMANDS = ("targets", "evaluate", "show", "export")
+SUBCOMMANDS = ("targets", "place", "evaluate", "show", "export")
 
 
 def add_parser(subparsers: Any) -> None:
     """Add the group with its subcommands."""
     parser = subparsers.add_parser(
         "probes",
-        help="light probes: path-trace their targets, judge, draw and export them",
+        help="light probes: path-trace their targets, place, judge, draw and export them",
         description=textwrap.fill("Light probes. 'difflpv probes COMMAND --help' explains a command.", 100),
         epilog="example:\n  difflpv probes export --help",
         formatter_class=argparse.RawDescriptionHelpFormatter,
