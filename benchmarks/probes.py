@@ -250,7 +250,10 @@ def main(argv: list[str] | None = None) -> None:
             args.out,
             _command(args),
             results,
-            {entry.name: {"method": entry.method, "content": entry.content} for entry in entries},
+            {
+                entry.name: {"method": entry.method, "content": entry.content, "variant": entry.edge_rays or entry.sight}
+                for entry in entries
+            },
             {s.scene.name: tolerances(s, results[s.scene.name], wanted) for s in scenes}
             if "gradient" in args.methods else {},
             {

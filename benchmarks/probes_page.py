@@ -15,7 +15,6 @@ MARK = "<!-- generated -->"
 GRID = "uniform grid"
 HEURISTICS = ("spawn_merge", "spawn_merge_hierarchical", "irradiance_ascent", "greedy_removal")  # methods 2 to 4
 OURS = "gradient"
-CHARTED = ("grid", "grid_moved", *HEURISTICS, "sbplx", "crs2", "bobyqa", "cma", OURS)
 PLACE_LIMIT, LOOKUP_LIMIT = 180.0, 1e6  # seconds for 64 probes; points per second of a core at 256
 
 Results = Mapping[str, Mapping[str, Mapping[str, Sequence[Mapping[str, Any]]]]]
@@ -27,10 +26,10 @@ class Reader:
 
     Attributes:
         results: by scene, entry and count.
-        entries: method and content of each entry.
+        entries: method, content and "variant" (beside the chart) of each entry.
     """
 
-    def __init__(self, results: Results, entries: Mapping[str, Mapping[str, str]]) -> None:
+    def __init__(self, results: Results, entries: Mapping[str, Mapping[str, Any]]) -> None:
         self.results, self.entries = results, entries
 
     def values(self, scene: str, name: str, count: str, what: str, content: str | None = None) -> list[float]:
@@ -44,8 +43,8 @@ class Reader:
         return float(np.mean(found)) if found else float("nan")
 
     def named(self, *methods: str) -> list[str]:
-        """Entries of these methods, read as they are published."""
-        return [name for name, entry in self.entries.items() if entry["method"] in methods]
+        """Entries of these methods, without the variants that are beside the chart."""
+        return [name for name, entry in self.entries.items() if entry["method"] in methods and not entry["variant"]]
 
     def best_heuristic(self, scene: str, count: str, content: str | None = None) -> tuple[float, str]:
         """The least error of methods 2 to 4, and whose it is."""
@@ -68,7 +67,7 @@ def write_page(
     path: Path,
     command: str,
     results: Results,
-    entries: Mapping[str, Mapping[str, str]],
+    entries: Mapping[str, Mapping[str, Any]],
     tolerances: Mapping[str, Sequence[Mapping[str, Any]]],
     about: Mapping[str, Mapping[str, Any]],
 ) -> None:
@@ -92,6 +91,7 @@ def write_page(
         "Line: mean of the seeds; band: their range. Published methods with traced content, ours with fitted content.",
         f"![Leak against the number of probes]({path.stem}/leak.png)",
     ]  # fmt: skip
+    parts += ["## Against walls: edge rays, sight, footprints", _walls(reader)]
     if any(tolerances.values()):
         parts += ["## As few as a tolerance needs", _tolerance_table(tolerances)]
     for scene in results:
@@ -102,9 +102,7 @@ def write_page(
 
 def _curves(reader: Reader, scene: str, what: str) -> dict[str, dict[int, list[tuple[float, float]]]]:
     found: dict[str, dict[int, list[tuple[float, float]]]] = {}
-    for name in reader.named(*CHARTED):
-        if "edge rays" in name or "sight" in name:
-            continue
+    for name in (name for name, entry in reader.entries.items() if not entry["variant"]):
         for count in reader.results[scene].get(name, {}):
             placed = reader.values(scene, name, count, "count")
             values = reader.values(scene, name, count, what)
@@ -190,6 +188,23 @@ def _slowest(reader: Reader, name: str) -> str:
 def _slowest_lookups(reader: Reader, name: str) -> str:
     found = [v for scene in reader.results for v in reader.values(scene, name, "256", "lookups_per_second", "traced")]
     return "-" if not found else f"{min(found) / 1e6:.2f} M at least: {_verdict(min(found) >= LOOKUP_LIMIT)}"
+
+
+def _walls(reader: Reader) -> str:
+    names = [GRID, *(name for name, entry in reader.entries.items() if entry["variant"]), *reader.named(OURS)]
+    lines = [
+        "Error; leak, and in brackets the share of points that it is taken at: those whose tetrahedron of the method's own "
+        "probes is cut by a wall. Edge rays spend probes on walls; sight leaves the probes as they are and costs lookups; ours has neither.", "",
+        f"| scene, probes | {' | '.join(names)} |", "|---|" + "---|" * len(names),
+    ]  # fmt: skip
+    for scene in reader.results:
+        for count in reader.counts():
+            cells = []
+            for name in names:
+                values = [reader.mean(scene, name, count, what) for what in ("error", "leak", "cut_share")]
+                cells.append("-" if values[0] != values[0] else "{:.3f}; {:.3f} ({:.2f})".format(*values))
+            lines.append(f"| {scene}, {count} | {' | '.join(cells)} |")
+    return "\n".join(lines)
 
 
 def _tolerance_table(tolerances: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
