@@ -194,7 +194,8 @@ def _walls(reader: Reader) -> str:
     names = [GRID, *(name for name, entry in reader.entries.items() if entry["variant"]), *reader.named(OURS)]
     lines = [
         "Error; leak, and in brackets the share of points that it is taken at: those whose tetrahedron of the method's own "
-        "probes is cut by a wall. Edge rays spend probes on walls; sight leaves the probes as they are and costs lookups; ours has neither.", "",
+        "probes is cut by a wall. Edge rays spend probes on walls; sight leaves the probes as they are and costs lookups; ours "
+        "has neither.", "",
         f"| scene, probes | {' | '.join(names)} |", "|---|" + "---|" * len(names),
     ]  # fmt: skip
     for scene in reader.results:
