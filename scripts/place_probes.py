@@ -25,7 +25,9 @@ def main(argv=None):
     parser.add_argument("--out", type=Path, default=Path("out/place_probes"), help="folder for targets and probes")
     parser.add_argument("--count", type=int, default=64, help="probes")
     parser.add_argument("--steps", type=int, default=300, help="of descent")
-    parser.add_argument("--points", type=int, default=2000, help="where the truth is path-traced")
+    how = "how points read probes: as engines do, or by fitted footprints"
+    parser.add_argument("--interpolation", choices=("tetrahedra", "gaussian"), default="tetrahedra", help=how)
+    parser.add_argument("--points", type=int, default=4000, help="where the truth is path-traced")
     parser.add_argument("--spp", type=int, default=1024, help="paths per point")
     parser.add_argument("--cells", type=int, default=24, help="of the field along the longest edge")
     args = parser.parse_args(argv)
@@ -33,13 +35,14 @@ def main(argv=None):
     scene = load_scene("cornell")
     common = {"count": args.points, "spp": args.spp, "lattice_spp": max(args.spp // 4, 1), "cells": args.cells, "workers": 2}
     # The first light set is the scene's own in both; it places and does not judge.
-    placing = make_probe_targets(scene, args.out / "placing", light_sets=moved_light_sets(scene, 4, seed=0), **common)
-    judging = make_probe_targets(scene, args.out / "judging", light_sets=moved_light_sets(scene, 3, seed=1), seed=1, **common)
+    placing = make_probe_targets(scene, args.out / "placing", light_sets=moved_light_sets(scene, 5, seed=0), **common)
+    judging = make_probe_targets(scene, args.out / "judging", light_sets=moved_light_sets(scene, 4, seed=1), seed=1, **common)
     held_out = HeldOut.of(scene, judging, placing)
 
     task, found = placement_task(scene, placing), {}
-    checkpoint = args.out / "checkpoint.pt"  # the same command goes on where it was stopped
-    for method, options in (("grid", {}), ("gradient", {"steps": args.steps, "checkpoint": checkpoint})):
+    ours = {"interpolation": args.interpolation, "steps": args.steps}
+    ours["checkpoint"] = args.out / f"{args.interpolation}.pt"  # the same command goes on where it was stopped
+    for method, options in (("grid", {}), ("gradient", ours)):
         placement = place(task, args.count, method, **options)
         traced = held_out.traced(placement.position, spp=args.spp, workers=2)  # what the probes hold under the judging lights
         content = held_out.fitted(placement.position, placement.reader, traced)
