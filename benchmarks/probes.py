@@ -52,7 +52,7 @@ from difflpv.scene import Scene
 TRAIN_POINTS = 6000  # of those of the placing targets, drawn by the seed
 USEFUL = 16  # probes, up to which solvers without derivatives get anywhere in 750 evaluations
 PICTURED = ("uniform grid", "greedy removal", "ours, tetrahedra", "ours, footprints")
-SEEDED = 64  # probes, up to which all seeds run; above, the first one alone: the spread is small there, and the work is not
+SEEDED = 64  # probes, up to which all seeds run; above, the first one alone, for time
 WITH_EDGE_RAYS = 2 / 3  # share of the probes that a method places itself, where edge rays place the rest
 
 
