@@ -25,7 +25,8 @@ SPREADS = (1.0, 1.1, 1.2, 1.3)
 
 MOVE_LIMIT = 0.45
 _SHAPES = 3  # as many shapes are tried by their training error
-_REFINEMENTS = 8
+_REFINEMENTS = 24  # finer grids that are tried, up to
+_FINEST = 4.0  # times the probes asked for
 
 
 class FreeSpace(Protocol):
@@ -54,7 +55,7 @@ def uniform_grids(
 ) -> list[UniformGrid]:
     """The finest grids of near-cubic spacing of which at most ``count`` probes lie in free space, best proportions first.
 
-    Where probes fall into solids, a finer grid takes the place of the one with ``count`` probes, so that none is wasted.
+    Where probes fall into solids, finer grids come first, so that none is wasted.
 
     Args:
         task: says what box to fill (that of a placement's points), and where free space is.
@@ -63,7 +64,7 @@ def uniform_grids(
         margin: if given, probes in solids are first moved out of them, this share of the smallest spacing off the surface.
 
     Returns:
-        Up to three grids with their free probes alone; none if no grid has any.
+        Up to three such grids, and up to three of ``count`` probes, with their free probes alone; none if no grid has any.
     """
     low, high = task.bounds
 
@@ -71,15 +72,16 @@ def uniform_grids(
         grids = [_free(task, _grid(low, high, shape, spread), margin) for shape in _shapes(high - low, total)[:_SHAPES]]
         return [grid for grid in grids if 0 < len(grid.position) <= count]
 
-    best, kept, total = fitting(count), 0, count
-    for _ in range(_REFINEMENTS):  # as many nodes as leave the right number, if the share in free space stays the same
-        kept = max((len(grid.position) for grid in best), default=0)
-        total = min(max(total + 1, round(total * count / max(kept, 1))), 4 * count)
-        finer = [grid for grid in fitting(total) if len(grid.position) > kept]
-        if kept == count or not finer:
+    plain = best = fitting(count)
+    kept = max((len(grid.position) for grid in best), default=0)
+    for total in sorted({round(count * _FINEST ** (k / _REFINEMENTS)) for k in range(1, _REFINEMENTS + 1)} - {count}):
+        if kept == count:
             break
-        best = finer
-    return best
+        finer = fitting(total)
+        most = max((len(grid.position) for grid in finer), default=0)
+        if most > kept:
+            best, kept = finer, most
+    return best if best is plain else best + plain
 
 
 def first_grid(journal: Journal, count: int) -> UniformGrid:
