@@ -241,7 +241,7 @@ def main(argv: list[str] | None = None) -> None:
                     by_count.setdefault(str(count), []).append(scene.result(entry, count, seed))
     if args.out:
         pictured = args.pictured if args.pictured in args.counts else args.counts[0]
-        for scene in scenes:
+        for scene in (s for s, name in zip(scenes, args.scenes, strict=True) if name == s.scene.name):  # others' are not ours
             names = [name for name in PICTURED if str(pictured) in results[scene.scene.name].get(name, {})]
             picture = placed_picture(scene, results[scene.scene.name], names, pictured)
             write_bytes(chart_folder(args.out) / f"{scene.scene.name}.png", picture)

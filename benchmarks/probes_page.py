@@ -73,7 +73,7 @@ def write_page(
 ) -> None:
     """Write, or renew, what stands behind the mark of a document, and charts into a folder of its name beside it.
 
-    A picture of each scene is expected there.
+    Pictures that lie there by a scene's name are shown.
     """
     reader = Reader(results, entries)
     folder = chart_folder(path)
@@ -95,8 +95,9 @@ def write_page(
     if any(tolerances.values()):
         parts += ["## As few as a tolerance needs", _tolerance_table(tolerances)]
     for scene in results:
-        picture = f"![Where the probes stand in {scene}]({path.stem}/{scene}.png)"
-        parts += [f"## {scene}", _about(about[scene]), picture, *_tables(reader, scene)]
+        picture = [f"![Where the probes stand in {scene}]({path.stem}/{scene}.png)"]
+        pictured = picture if (folder / f"{scene}.png").exists() else []
+        parts += [f"## {scene}", _about(about[scene]), *pictured, *_tables(reader, scene)]
     write_text(path, "\n\n".join(parts) + "\n")
 
 
