@@ -177,10 +177,11 @@ def gaussian_kernels(scalar: Any) -> GaussianKernels:
             d = wp.min(wp.length_sq(metric[p] * (points[row] - position[p])), far)
             if held < count or d < distance[row, count - 1]:
                 at = wp.min(held, count - 1)
-                while at > 0 and distance[row, wp.max(at - 1, 0)] > d:
-                    distance[row, at] = distance[row, at - 1]
-                    near[row, at] = near[row, at - 1]
-                    at -= 1
+                for _ in range(count - 1):
+                    if at > 0 and distance[row, wp.max(at - 1, 0)] > d:
+                        distance[row, at] = distance[row, at - 1]
+                        near[row, at] = near[row, at - 1]
+                        at -= 1
                 distance[row, at] = d
                 near[row, at] = p
                 held = wp.min(held + 1, count)
