@@ -26,6 +26,7 @@ SPREADS = (1.0, 1.1, 1.2, 1.3)
 MOVE_LIMIT = 0.45
 _SHAPES = 3  # as many shapes are tried by their training error
 _REFINEMENTS = 24  # finer grids that are tried, up to
+_MOVED_REFINEMENTS = 4  # where probes move out of solids, which few lose and takes long to find out
 _FINEST = 4.0  # times the probes asked for
 
 
@@ -74,8 +75,9 @@ def uniform_grids(
 
     plain = best = fitting(count)
     kept = max((len(grid.position) for grid in best), default=0)
-    for total in sorted({round(count * _FINEST ** (k / _REFINEMENTS)) for k in range(1, _REFINEMENTS + 1)} - {count}):
-        if kept == count:
+    tried, enough = (_REFINEMENTS, count) if margin is None else (_MOVED_REFINEMENTS, 0.95 * count)
+    for total in sorted({round(count * _FINEST ** (k / tried)) for k in range(1, tried + 1)} - {count}):
+        if kept >= enough:
             break
         finer = fitting(total)
         most = max((len(grid.position) for grid in finer), default=0)
