@@ -31,7 +31,7 @@ from difflpv.probes.gaussian import GaussianInterpolation, isotropic_metric
 from difflpv.probes.lookup import probe_irradiance
 from difflpv.probes.rows import Interpolation
 from difflpv.probes.tetrahedra import Tetrahedra, TetrahedralInterpolation
-from difflpv.probes.visible import VisibleInterpolation
+from difflpv.probes.visible import Sight, VisibleInterpolation
 from difflpv.raycast import Raycaster
 from difflpv.reference.gaussian import dense_footprint_weights
 from difflpv.reference.tetrahedra import dense_weights
@@ -148,14 +148,15 @@ def sight(name: str) -> dict[str, float]:
     x, read = rng.uniform(low, high, (64, 3)), rng.uniform(low, high, (4000, 3))
     position, points = torch.as_tensor(x), torch.as_tensor(read)
     inner = TetrahedralInterpolation(position)
-    seeing = VisibleInterpolation(inner, scene, raycaster=raycaster)
+    eyes = Sight(scene, raycaster=raycaster)
+    seeing = VisibleInterpolation(inner, eyes)
     plain = inner.rows(position, points)
     pairs = np.repeat(read, 4, axis=0), x[plain.probe.numpy()].reshape(-1, 3)
     blocked = torch.as_tensor(raycaster.blocked(*pairs, shortened=False).reshape(-1, 4))
     counted = plain.weight > 1e-3
     lit = (~blocked & (plain.weight > 0.05)).any(1)
     weight = seeing.rows(position, points).weight
-    agree = (seeing.visibility(position, points, plain.probe) > 0.5) != blocked
+    agree = (eyes.visibility(position, points, plain.probe) > 0.5) != blocked
     steps = []
     for k in range(6):
         moved = (position + 0.001 * k).requires_grad_()

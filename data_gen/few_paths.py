@@ -27,26 +27,31 @@ def trace_paths(
     tracer: PathTracer, position: np.ndarray, normal: np.ndarray, component: str, *, samples: int, seed: int
 ) -> np.ndarray:
     """Irradiance [n,3] W/m2 of receivers [n,3] m with normals [n,3] by so many paths each, a power of two."""
-    wanted, parts = Components.of([component]), []
-    step = max(1, _PATHS_PER_CALL // samples)
-    for begin in range(0, len(position), step):
-        rows = slice(begin, begin + step)
-        means = irradiance_block(
-            tracer, position[rows], normal[rows], wanted, samples=samples, seed=seed, address=(begin,), replicates=1
-        )
-        parts.append(means[0, :, 0])
-    return np.concatenate(parts) if parts else np.zeros((0, 3))
+    return _in_parts(irradiance_block, tracer, (position, normal), component, samples, seed, (3,))
 
 
 def trace_probe_paths(tracer: PathTracer, position: np.ndarray, component: str, *, samples: int, seed: int) -> np.ndarray:
     """Radiance SH toward the incoming light [n,9,3] W/m2 of probes [n,3] m by so many paths each, a power of two."""
-    wanted, parts = Components.of([component]), []
+    return _in_parts(probe_block, tracer, (position,), component, samples, seed, (9, 3))
+
+
+def _in_parts(
+    block: Callable[..., np.ndarray],
+    tracer: PathTracer,
+    entities: tuple[np.ndarray, ...],
+    component: str,
+    samples: int,
+    seed: int,
+    shape: tuple[int, ...],
+) -> np.ndarray:
+    """What a block of ``data_gen.estimators`` finds [n, *shape] for ``entities`` [n,3], so many at a time."""
+    wanted, parts = Components.of([component]), [np.zeros((0, *shape))]
     step = max(1, _PATHS_PER_CALL // samples)
-    for begin in range(0, len(position), step):
-        rows = position[begin : begin + step]
-        means = probe_block(tracer, rows, wanted, samples=samples, seed=seed, address=(begin,), replicates=1)
+    for begin in range(0, len(entities[0]), step):
+        rows = [part[begin : begin + step] for part in entities]
+        means = block(tracer, *rows, wanted, samples=samples, seed=seed, address=(begin,), replicates=1)
         parts.append(means[0, :, 0])
-    return np.concatenate(parts) if parts else np.zeros((0, 9, 3))
+    return np.concatenate(parts)
 
 
 class PathPool:

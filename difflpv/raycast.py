@@ -68,6 +68,14 @@ class Raycaster:
         limit = length - 2 * self.offset if shortened else length
         return self.blocked_along(origins, delta / np.maximum(length, 1e-30)[:, None], limit)
 
+    def blocked_from_either_end(self, origins: np.ndarray, targets: np.ndarray) -> np.ndarray:
+        """True where a ray from one end or the other of the segments [n,3] m, off every surface, meets a triangle.
+
+        A ray may miss a surface that it starts closer to than it can tell.
+        """
+        there = self.blocked(origins, targets, shortened=False)
+        return np.asarray(there | self.blocked(targets, origins, shortened=False))
+
     def blocked_along(self, origins: np.ndarray, directions: np.ndarray, distance: np.ndarray | float) -> np.ndarray:
         """True where a ray meets a triangle within ``distance`` [n] or scalar, m; ``np.inf`` for a parallel light."""
         if not len(origins):

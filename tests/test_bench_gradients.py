@@ -5,7 +5,7 @@ import pytest
 
 from data_gen.few_paths import trace_paths
 from data_gen.pathtracer import PathTracer
-from difflpv.bench import gradients
+from difflpv.bench import breakeven, gradients
 from difflpv.bench.configuration import chosen
 from difflpv.bench.gradients import equal_samples, gradient_task, measure_gradients, moved_light
 from difflpv.bench.measure import measure, prepare
@@ -64,7 +64,7 @@ def test_rows_without_mitsuba_and_as_text(cornell, monkeypatch):
     monkeypatch.setattr(gradients, "unavailable", lambda: "not here")
     points = measure(chosen(NAMES), cornell, repeats=1, gradients=False, memory=False)
     assert measure_gradients([p for p in points if p.family == "path tracer"], cornell, SIZES) == []
-    monkeypatch.setattr(gradients, "EQUAL_ERROR", 1.0)
+    monkeypatch.setattr(breakeven, "EQUAL_ERROR", 1.0)
     (row,) = measure_gradients(points, cornell, SIZES)
     assert row["replay"] is None and row["counts"] == [100] and row["ours"][0] > 0 and row["differences"][0] > 0
     assert row["difference_samples"] > 0 and 0 < row["place"]["error"] and row["power"]["samples"] is None

@@ -13,7 +13,7 @@ from difflpv.probes.footprints import nearest_footprints
 from difflpv.probes.gaussian import GaussianInterpolation, isotropic_metric
 from difflpv.probes.reader import ProbeReader
 from difflpv.probes.tetrahedra import TetrahedralInterpolation
-from difflpv.probes.visible import VisibleInterpolation
+from difflpv.probes.visible import Sight, VisibleInterpolation
 from difflpv.reference.gaussian import dense_footprint_weights
 from difflpv.reference.gaussian import nearest_footprints as reference_footprints
 from difflpv.scene import Scene
@@ -292,14 +292,15 @@ def test_readers_with_sight_read_nothing_through_a_wall():
 def test_eyes_over_another_interpolation_share_what_was_seen(monkeypatch):
     x, metric, _ = footprints(10, 2)
     points = torch.from_numpy(np.random.default_rng(3).uniform(-0.8, 0.8, (15, 3)))
-    sight = VisibleInterpolation(GaussianInterpolation(metric), divided_box())
+    eyes = Sight(divided_box())
+    sight = VisibleInterpolation(GaussianInterpolation(metric), eyes)
     rays = []
-    closest = sight._raycaster.closest
-    monkeypatch.setattr(sight._raycaster, "closest", lambda o, d: rays.append(len(o)) or closest(o, d))
+    closest = eyes._raycaster.closest
+    monkeypatch.setattr(eyes._raycaster, "closest", lambda o, d: rays.append(len(o)) or closest(o, d))
     sight.rows(x, points)
-    other = sight.around(GaussianInterpolation(metric * 1.5))
+    other = VisibleInterpolation(GaussianInterpolation(metric * 1.5), eyes)
     assert torch.equal(other.rows(x, points).weight, VisibleInterpolation(
-        GaussianInterpolation(metric * 1.5), divided_box()).rows(x, points).weight)  # fmt: skip
+        GaussianInterpolation(metric * 1.5), Sight(divided_box())).rows(x, points).weight)  # fmt: skip
     assert rays[0] > 0
     assert sum(rays[1:]) < 0.5 * rays[0]  # only for probes that the first one did not read
     before = len(rays)

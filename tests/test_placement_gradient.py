@@ -16,10 +16,10 @@ from difflpv.placement.place import place
 from difflpv.placement.population import removal_damage, with_spawned, without_least
 from difflpv.placement.reconstruction import Reconstruction, irradiance_coordinates, reconstruction_error
 from difflpv.placement.uniform import place_grid
-from difflpv.probes.gaussian import GaussianInterpolation, isotropic_metric
+from difflpv.probes.gaussian import isotropic_metric
 from difflpv.probes.lattice import LatticeField
 from difflpv.probes.probe_set import DIRECTIONS_26, irradiance_of
-from difflpv.probes.visible import VisibleInterpolation
+from difflpv.probes.visible import Sight
 
 QUICK = {"steps": 16, "relocations": 1}
 
@@ -63,7 +63,7 @@ def test_principal_channels_change_the_error_by_no_more_than_what_they_leave_out
 def test_gradient_against_finite_differences(task, interpolation, content):
     down = descent(task, interpolation, content=content, barrier=0.1, margin=0.3, leak=0.2, coverage=0.3, reach=0.4)
     probes = some_probes(task, footprints=interpolation == "gaussian")
-    eyes = VisibleInterpolation(GaussianInterpolation(torch.eye(3)[None]), task.scene)
+    eyes = Sight(task.scene)
 
     def total(position, metric):
         rows = down.reader(position, metric).rows(position, task.points)
@@ -118,7 +118,7 @@ def test_a_probe_that_no_point_sees_counts_as_inside_a_solid():
 
 def test_each_penalty_falls_where_it_is_obeyed(task):
     down = descent(task)
-    eyes = VisibleInterpolation(GaussianInterpolation(torch.eye(3)[None]), task.scene)
+    eyes = Sight(task.scene)
 
     def term(position, **weights):
         position = torch.tensor(position, dtype=torch.float64)

@@ -11,7 +11,7 @@ from difflpv.probes.lookup import probe_irradiance
 from difflpv.probes.probe_set import DIRECTIONS_26, irradiance_of
 from difflpv.probes.tetrahedra import TetrahedralInterpolation
 from difflpv.probes.trilinear import GridInterpolation
-from difflpv.probes.visible import VisibleInterpolation
+from difflpv.probes.visible import Sight, VisibleInterpolation
 from difflpv.scene import Scene
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -155,8 +155,12 @@ def test_inverse_distance_gradients_and_coincident_probes():
 # Visibility
 
 
-def visible(inner=None, *, hole=0.0, **options):
-    return VisibleInterpolation(inner or InverseDistanceInterpolation(neighbours=8), divided_box(hole), **options)
+def eyes(*, hole=0.0, **options):
+    return Sight(divided_box(hole), **options)
+
+
+def visible(inner=None, *, floor=1e-3, **options):
+    return VisibleInterpolation(inner or InverseDistanceInterpolation(neighbours=8), eyes(**options), floor=floor)
 
 
 INNER = {
@@ -186,7 +190,7 @@ def test_visibility_is_one_before_a_wall_however_slanted_and_softly_ends_behind_
     height = torch.tensor([-1e-3, 0.0, 0.02, 0.05], dtype=torch.float64)
     position = torch.stack([height, torch.full_like(height, 0.3), torch.full_like(height, 0.3)], 1)
     points = torch.tensor([[-0.3, -0.5, -0.1]], dtype=torch.float64)  # 19 degrees from the wall
-    seen = visible(softness=0.04).visibility(position, points, torch.tensor([[0, 1, 2, 3]]))[0]
+    seen = eyes(softness=0.04).visibility(position, points, torch.tensor([[0, 1, 2, 3]]))[0]
     torch.testing.assert_close(seen, torch.tensor([1.0, 1.0, 0.5, 0.0], dtype=torch.float64), rtol=0, atol=1e-6)
 
 
@@ -201,7 +205,7 @@ def test_visibility_changes_smoothly_as_a_probe_passes_an_opening():
     height = torch.linspace(-0.9, 0.9, 4001, dtype=torch.float64)
     position = torch.stack([torch.full_like(height, 0.5), torch.full_like(height, 0.1), height], 1)
     points = torch.tensor([[-0.5, 0.1, 0.4]], dtype=torch.float64)
-    seen = visible(hole=0.8).visibility(position, points, torch.arange(4001)[None])[0]
+    seen = eyes(hole=0.8).visibility(position, points, torch.arange(4001)[None])[0]
     assert (seen[0], seen[-1]) == (0, 1)
     assert (seen[1:] - seen[:-1]).abs().max() < 0.02  # in steps of 0.45 mm; a single ray would jump by 1
     middle = height[(seen - 0.5).abs().argmin()]
@@ -213,8 +217,8 @@ def test_visibility_gradients():
     x = torch.from_numpy(rng.uniform(-0.9, 0.9, (10, 3)))
     x[::2, 0] = torch.from_numpy(rng.uniform(0.005, 0.035, 5))  # within the softness behind the wall
     points = torch.from_numpy(rng.uniform(-0.9, -0.2, (6, 3)))
-    sight = visible(InverseDistanceInterpolation(neighbours=10), hole=0.8, softness=0.05)
-    assert dense_gradcheck(sight, x, points)
+    sight = eyes(hole=0.8, softness=0.05)
+    assert dense_gradcheck(VisibleInterpolation(InverseDistanceInterpolation(neighbours=10), sight), x, points)
     x.requires_grad_()
     probe = torch.arange(10).expand(6, 10)
     (bar,) = torch.autograd.grad(sight.visibility(x, points, probe).sum(), x)
@@ -222,10 +226,11 @@ def test_visibility_gradients():
 
 
 def test_receivers_look_once_for_each_direction(monkeypatch):
-    sight, x, points = visible(), random_points(20, 0), random_points(30, 1)
+    look, x, points = eyes(), random_points(20, 0), random_points(30, 1)
+    sight = VisibleInterpolation(InverseDistanceInterpolation(neighbours=8), look)
     rays = []
-    closest = sight._raycaster.closest
-    monkeypatch.setattr(sight._raycaster, "closest", lambda o, d: rays.append(len(o)) or closest(o, d))
+    closest = look._raycaster.closest
+    monkeypatch.setattr(look._raycaster, "closest", lambda o, d: rays.append(len(o)) or closest(o, d))
     first = dense(sight, x, points)
     assert torch.equal(dense(sight, x, points), first)
     assert 0 < rays[0] <= 30 * 256

@@ -20,7 +20,7 @@ from difflpv.bench.settings import BenchSettings
 from difflpv.bench.timing import interleaved, timed
 from difflpv.bench.volume import VolumeRun
 
-__all__ = ["EQUAL_ERROR", "crossing", "measure_break_even"]
+__all__ = ["EQUAL_ERROR", "crossing", "learned_that_meet", "measure_break_even"]
 
 EQUAL_ERROR = 0.2
 COUNTS = (1_000, 3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000, 10_000_000)
@@ -40,6 +40,12 @@ def crossing(counts: Sequence[int], ours: Sequence[float], theirs: Sequence[floa
     return float(np.exp(np.log(counts[k]) + share * (np.log(counts[k + 1]) - np.log(counts[k]))))
 
 
+def learned_that_meet(points: Sequence[Point]) -> list[Point]:
+    """Learned configurations with an error of at most ``EQUAL_ERROR``; fits are the pay-off's question."""
+    able = [p for p in points if p.family == "learned" and p.solve and "fit" not in p.setup_seconds]
+    return [p for p in able if p.error <= EQUAL_ERROR]
+
+
 def measure_break_even(
     points: Sequence[Point], scene: BenchScene, settings: BenchSettings, *, pool: PathPool | None = None
 ) -> dict[str, Any] | None:
@@ -56,8 +62,7 @@ def measure_break_even(
         what has changed, ``peers`` with their paths, seconds, break-even and speed-up; None where nothing meets 0.2.
     """
     by_name = {c.name: c for c in LADDER}
-    # fits are the pay-off's question (difflpv.bench.payoff)
-    able = [p for p in points if p.family == "learned" and p.error <= EQUAL_ERROR and p.solve and "fit" not in p.setup_seconds]
+    able = learned_that_meet(points)
     if not able:
         return None
     best = min(able, key=lambda p: (p.seconds or 0) + p.lights_seconds)

@@ -13,9 +13,7 @@ project's path tracer are a peer as well: one render and six more for each light
 from __future__ import annotations
 
 import math
-import multiprocessing
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -24,7 +22,8 @@ import numpy as np
 
 from data_gen.few_paths import PathPool, trace_paths
 from data_gen.pathtracer import PathTracer
-from difflpv.bench.breakeven import EQUAL_ERROR
+from data_gen.workers import start_pool
+from difflpv.bench.breakeven import learned_that_meet
 from difflpv.bench.configuration import chosen
 from difflpv.bench.measure import Point, prepare
 from difflpv.bench.mitsuba_gradient import PathReplay
@@ -139,8 +138,11 @@ def _traced(
     work = partial(_trace, bench.position, bench.normal, bench.component, samples)
     if workers == 1:
         return {key: work(job) for key, job in jobs.items()}
-    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
+    pool = start_pool(workers)
+    try:
         return dict(zip(jobs, pool.map(work, jobs.values()), strict=True))
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def _trace(position: np.ndarray, normal: np.ndarray, component: str, samples: int, job: tuple[Scene, int]) -> np.ndarray:
@@ -175,7 +177,7 @@ def measure_gradients(
         pass, ``ours`` and ``replay``, and of ``differences``. Empty
         where nothing meets 0.2, where a light is no area light, or for direct light.
     """
-    fits = [p for p in points if p.family == "learned" and p.error <= EQUAL_ERROR and p.solve and "fit" not in p.setup_seconds]
+    fits = learned_that_meet(points)
     areas = all(isinstance(light, AreaLight) for light in scene.scene.lights)
     if not fits or not areas or scene.component != "bounce1":
         return []

@@ -11,7 +11,7 @@ from typing import Any
 
 from difflpv.cli.options import UsageError
 
-__all__ = ["Progress", "jsonable", "make_folder", "print_json", "warn"]
+__all__ = ["Progress", "jsonable", "last_change", "make_folder", "print_json", "warn"]
 
 
 def warn(lines: Iterable[str]) -> None:
@@ -36,6 +36,11 @@ def jsonable(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return str(value) if isinstance(value, Path) else value
+
+
+def last_change(path: Path) -> int | None:
+    """When a file was written last [ns], None where there is none: to tell what a command found from what it made."""
+    return path.stat().st_mtime_ns if path.is_file() else None
 
 
 def make_folder(option: str, folder: Path) -> Path:

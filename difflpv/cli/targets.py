@@ -18,7 +18,7 @@ from difflpv.cli.options import (
     positive,
     seeded,
 )
-from difflpv.cli.output import print_json, warn
+from difflpv.cli.output import last_change, print_json, warn
 
 if TYPE_CHECKING:
     from data_gen.load import Targets
@@ -98,7 +98,7 @@ def run(args: argparse.Namespace) -> int:
         check_indices("--light", chosen, len(every), source)
         sets, numbers = [every[k] for k in chosen], list(chosen)
     manifest = args.out / MANIFEST
-    before = manifest.stat().st_mtime_ns if manifest.is_file() else None
+    before = last_change(manifest)
     targets = make_targets(
         scene,
         args.out,
@@ -118,7 +118,7 @@ def run(args: argparse.Namespace) -> int:
         overwrite=args.overwrite,
         progress=False if args.json else None,
     )
-    recognised = manifest.stat().st_mtime_ns == before
+    recognised = last_change(manifest) == before
     warn(_unreached(args, targets))
     if args.json:
         print_json(

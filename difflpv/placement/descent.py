@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -15,10 +15,10 @@ from difflpv.placement.penalties import Penalties
 from difflpv.placement.reconstruction import Reconstruction, fitted_content, relative_error
 from difflpv.placement.task import PlacementTask
 from difflpv.probes.gaussian import GaussianInterpolation
-from difflpv.probes.reader import InterpolationName
+from difflpv.probes.reader import InterpolationName, ProbeReader
 from difflpv.probes.rows import Interpolation, Rows
 from difflpv.probes.tetrahedra import TetrahedralInterpolation
-from difflpv.probes.visible import VisibleInterpolation
+from difflpv.probes.visible import Sight, VisibleInterpolation
 
 __all__ = ["Descent", "Probes"]
 
@@ -67,10 +67,9 @@ class Descent:
         return self.reconstruction.task
 
     @cached_property
-    def _eyes(self) -> VisibleInterpolation:
-        """What the points see; looked up once for all steps."""
-        nothing = GaussianInterpolation(torch.eye(3)[None])
-        return VisibleInterpolation(nothing, self.task.scene, raycaster=self.task.raycaster)
+    def _eyes(self) -> Sight:
+        """How far the points see; they look once for all steps."""
+        return Sight(self.task.scene, raycaster=self.task.raycaster)
 
     def reader(self, position: torch.Tensor, metric: torch.Tensor | None) -> Interpolation:
         """The interpolation over probes at ``position`` [n,3] m, differentiable in ``metric`` [n,3,3] 1/m."""
@@ -79,7 +78,11 @@ class Descent:
             inner = TetrahedralInterpolation(position)
         else:
             inner = GaussianInterpolation(metric, neighbours=self.neighbours)
-        return self._eyes.around(inner) if self.sight else inner
+        return VisibleInterpolation(inner, self._eyes) if self.sight else inner
+
+    def settled(self, probes: Probes) -> ProbeReader:
+        """How points are to read ``probes`` that stay where they are."""
+        return ProbeReader(self.interpolation, probes.metric, self.neighbours, self.sight)
 
     @torch.no_grad()
     def read(self, probes: Probes) -> tuple[Rows, torch.Tensor, torch.Tensor]:
@@ -104,24 +107,21 @@ class Descent:
     @torch.no_grad()
     def error_at(self, probes: Probes, judge: PlacementTask) -> float:
         """Relative L2 error at another task's points, with the content fitted to this one's (or the field's)."""
-        position, metric = _tensors(probes)
+        position, _ = _tensors(probes)
         held = torch.as_tensor(self.content(probes)) if self.reconstruction.content == "fitted" else judge.field(position)
-        # no sight here that remembers: the points are others
-        reader = replace(self, sight=False).reader(position, metric)
-        if self.sight:
-            reader = VisibleInterpolation(reader, judge.scene, raycaster=self.task.raycaster)
-        rows = reader.rows(position, judge.points)
-        return float(relative_error(judge, rows.apply(held)))
+        reader = self.settled(probes).over(probes.position, judge.scene, raycaster=self.task.raycaster)
+        return float(relative_error(judge, reader.rows(position, judge.points).apply(held)))
 
     def run(
-        self, probes: Probes, steps: int, *, rate: Callable[[float], float], told: Callable[[float], None] | None = None
+        self, probes: Probes, steps: int, first: float, last: float, *, told: Callable[[float], None] | None = None
     ) -> tuple[Probes, float]:
         """Go so many steps of Adam (Kingma and Ba 2015) and return the best probes on the way, with their training error.
 
         Args:
             probes: in free space.
             steps: how many.
-            rate: step length as a share of the box's longest edge, by the share of the steps that is done.
+            first: step length in the beginning as a share of the box's longest edge.
+            last: in the end; it falls evenly in between.
             told: called with the error after each step.
         """
         low, high = self.task.bounds
@@ -135,7 +135,6 @@ class Descent:
             groups.append({"params": [metric]})
             scale = float(metric.detach().abs().max()) * _METRIC_RATE
         adam = torch.optim.Adam(groups, lr=1.0, betas=_MOMENTS)
-        first = rate(0.0)
         best, least, lowest = probes, math.inf, math.inf
         for step in range(steps + 1):
             rows = self.reader(position, metric).rows(position, self.task.points)
@@ -150,7 +149,7 @@ class Descent:
                 break
             adam.zero_grad()
             total.backward()
-            length = rate(step / steps)
+            length = first + step / steps * (last - first)
             adam.param_groups[0]["lr"] = length * size
             if metric is not None:
                 adam.param_groups[1]["lr"] = scale * length / first

@@ -32,7 +32,7 @@ def tetrahedra_cut_by_walls(raycaster: Raycaster, position: np.ndarray, tetrahed
     pairs = np.sort(np.stack([tetrahedra[:, first], tetrahedra[:, second]], -1), -1)
     edges, of_cell = np.unique(pairs.reshape(-1, 2), axis=0, return_inverse=True)
     a, b = position[edges[:, 0]], position[edges[:, 1]]
-    cut = raycaster.blocked(a, b, shortened=False) | raycaster.blocked(b, a, shortened=False)
+    cut = raycaster.blocked_from_either_end(a, b)
     return np.asarray(cut[of_cell.reshape(len(tetrahedra), len(first))].any(1))
 
 

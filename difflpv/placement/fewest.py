@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,48 +14,43 @@ from difflpv.placement.population import without_least
 from difflpv.placement.segments import Segments
 from difflpv.placement.task import PlacementTask
 
-__all__ = ["Fewest", "fewest", "held_out_points"]
+__all__ = ["fewest", "held_out_points"]
 
 _FIRST = 8
 _HELD_OUT = 5  # every so manieth point judges
 _THINNED = (0.75, 0.88)  # of the probes, first in large steps, then in small ones
 
 
-@dataclass(frozen=True)
-class Fewest:
-    """What the search works with.
+def fewest(
+    descent: Descent,
+    judge: PlacementTask,
+    placed: Callable[[Descent, int, Probes | None], Probes],
+    segments: Segments,
+    *,
+    most: int,
+    tolerance: float,
+) -> dict[str, Any]:
+    """Leave the fewest probes found that meet a tolerance as the best of the segments.
 
-    Attributes:
-        task: what is known.
-        descent_on: makes the descent on a part of the task.
-        placed: places so many probes from a start, and tells the training error.
+    Args:
+        descent: on the points that probes are fitted to.
+        judge: points that neither positions nor content are fitted to: the error there has to meet the tolerance.
+        placed: places so many probes from a start, a grid if None.
         segments: keeps the best so far.
-    """
-
-    task: PlacementTask
-    descent_on: Callable[[PlacementTask], Descent]
-    placed: Callable[[Descent, int, Probes | None], tuple[Probes, float]]
-    segments: Segments
-
-
-def fewest(search: Fewest, most: int, tolerance: float) -> dict[str, Any]:
-    """Leave the fewest probes found that meet ``tolerance``, at most ``most``, as the best of the segments.
-
-    The error that has to meet it is that at points which neither positions nor content were fitted to.
+        most: probes at most.
+        tolerance: relative error.
 
     Returns:
         ``tolerance``, ``met``, ``held_out_error`` of the probes left, and ``tried``: (count, held-out error) in order.
     """
-    train, judge = held_out_points(search.task)
-    descent = search.descent_on(train)
     tried: list[tuple[int, float]] = []
 
     def attempt(count: int, start: Probes | None) -> tuple[Probes, float]:
         try:
-            probes, _ = search.placed(descent, count, start)
+            probes = placed(descent, count, start)
         finally:  # also where the work is broken off
             if met is not None:
-                search.segments.best = met[0]
+                segments.best = met[0]
         error = descent.error_at(probes, judge)
         tried.append((len(probes), error))
         return probes, error
@@ -76,7 +71,7 @@ def fewest(search: Fewest, most: int, tolerance: float) -> dict[str, Any]:
                     break
                 met = probes, error
         probes, error = met
-    search.segments.best = probes
+    segments.best = probes
     return {"tolerance": tolerance, "met": met is not None, "held_out_error": error, "tried": tuple(tried)}
 
 

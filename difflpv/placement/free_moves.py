@@ -46,15 +46,11 @@ class FreeMoves:
             if not len(rest):
                 break
             wanted = self._nearest(old[rest] + share * (new[rest] - old[rest]))
-            able = self._task.in_free_space(wanted, seen=False) & ~self._crosses(old[rest], wanted)
+            crosses = self._task.raycaster.blocked_from_either_end(old[rest], wanted)
+            able = self._task.in_free_space(wanted, seen=False) & ~crosses
             position[rest[able]] = wanted[able]
             stay[rest[able]] = False
         return position, stay
-
-    def _crosses(self, old: np.ndarray, new: np.ndarray) -> np.ndarray:
-        """Ways that meet a surface, looked at from both ends: a ray may miss one that it starts on."""
-        rays = self._task.raycaster
-        return np.asarray(rays.blocked(old, new, shortened=False) | rays.blocked(new, old, shortened=False))
 
     def _nearest(self, position: np.ndarray) -> np.ndarray:
         """The nearest place in a region."""

@@ -12,7 +12,7 @@ from difflpv.placement.task import PlacementTask
 from difflpv.probes.lattice import LatticeField, fill_from_neighbours
 from difflpv.scene import Scene
 
-__all__ = ["placement_task", "split_points"]
+__all__ = ["light_channels", "placement_task", "split_points"]
 
 
 def placement_task(
@@ -48,11 +48,11 @@ def placement_task(
             rows = rows[points if isinstance(points, slice) else np.asarray(points)]
         except IndexError:
             raise ValueError(f"points: expected indices of {len(rows)} points, got others") from None
-    field = fill_from_neighbours(_channels(targets.lattice[chosen]), targets.free)
+    field = fill_from_neighbours(light_channels(targets.lattice[chosen]), targets.free)
     return PlacementTask(
         scene,
         torch.as_tensor(targets.points[rows]),
-        torch.as_tensor(_channels(targets.radiance[chosen][:, rows])),
+        torch.as_tensor(light_channels(targets.radiance[chosen][:, rows])),
         LatticeField(targets.grid, torch.as_tensor(field)),
         LatticeField(targets.grid, torch.as_tensor(targets.clearance)),
     )
@@ -84,7 +84,7 @@ def split_points(targets: ProbeTargets, share: float = 0.75, *, seed: int = 0) -
     return np.flatnonzero(train), np.flatnonzero(~train)
 
 
-def _channels(values: np.ndarray) -> np.ndarray:
-    """[L, ..., 9, 3] -> [..., 9, 3 L], float64."""
+def light_channels(values: np.ndarray) -> np.ndarray:
+    """RGB of each light set [L,...,9,3] as the channels of a ``PlacementTask`` [...,9,3L], float64."""
     moved = np.moveaxis(values, 0, -2).astype(np.float64)
     return moved.reshape(*moved.shape[:-2], -1)

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from difflpv.placement.descent import Descent, Probes
-from difflpv.placement.fewest import Fewest, fewest
+from difflpv.placement.fewest import fewest, held_out_points
 from difflpv.placement.free_moves import FreeMoves, Region
 from difflpv.placement.journal import Journal
 from difflpv.placement.penalties import Penalties
@@ -27,7 +27,7 @@ from difflpv.placement.segments import Segments, task_digest
 from difflpv.placement.task import Placement, PlacementTask, Progress
 from difflpv.placement.uniform import SPREADS, uniform_grids
 from difflpv.probes.gaussian import isotropic_metric
-from difflpv.probes.reader import InterpolationName, ProbeReader
+from difflpv.probes.reader import InterpolationName
 
 __all__ = ["place_gradient"]
 
@@ -121,7 +121,8 @@ def place_gradient(
         if tolerance is None:
             work.placed(descent_on(task), count)
         else:
-            details |= fewest(Fewest(task, descent_on, work.placed, segments), count, tolerance)
+            train, judge = held_out_points(task)
+            details |= fewest(descent_on(train), judge, work.placed, segments, most=count, tolerance=tolerance)
     except KeyboardInterrupt:
         if segments.best is None:
             raise
@@ -129,7 +130,8 @@ def place_gradient(
     assert segments.best is not None
     descent = replace(descent_on(task), reconstruction=Reconstruction(task, content, ridge=ridge))
     details["training_error"] = descent.error(segments.best)
-    return _placement(journal, descent, segments.best, details)
+    radiance = None if content == "field" else descent.content(segments.best)
+    return journal.placement(segments.best.position, radiance=radiance, reader=descent.settled(segments.best), **details)
 
 
 @dataclass(frozen=True)
@@ -143,28 +145,28 @@ class _Work:
     rate: float
     seed: int
 
-    def placed(self, descent: Descent, count: int, start: Probes | None = None) -> tuple[Probes, float]:
-        """So many probes and their training error, from ``start`` (a shaken grid, if None)."""
+    def placed(self, descent: Descent, count: int, start: Probes | None = None) -> Probes:
+        """So many probes, from ``start`` (a shaken grid, if None)."""
         best = _start(descent, self.segments.journal, count, self.seed) if start is None else start
-        self.segments.best = best
-        least = math.inf
+        self.segments.best, least = best, math.inf
+
+        def descended(probes: Probes, steps: int, first: float, last: float) -> None:
+            nonlocal best, least
+            found, error = self.segments.run(descent, probes, steps, first, last)
+            if error < least:
+                self.segments.best = best = found
+                least = error
+
         each = max(1, self.steps // (2 * self.relocations + 2))
         for number in range(self.relocations):
             length = self.rate * (1 - number / (self.relocations + 1))
-            probes, error = self.segments.run(descent, best, each, length, 0.5 * length)
-            if error < least:
-                self.segments.best, best, least = probes, probes, error
+            descended(best, each, length, 0.5 * length)
             gone = round(self.share * len(best) * (1 - number / self.relocations))
             if gone and len(best) > gone:
                 fewer = without_least(descent, best, gone)
-                probes, error = self.segments.run(descent, with_spawned(descent, fewer, gone), each, length, 0.5 * length)
-                if error < least:
-                    self.segments.best, best, least = probes, probes, error
-        length = self.rate / (self.relocations + 1)
-        probes, error = self.segments.run(descent, best, 2 * each, length, _SLOWEST * self.rate)
-        if error < least:
-            self.segments.best, best, least = probes, probes, error
-        return best, least
+                descended(with_spawned(descent, fewer, gone), each, length, 0.5 * length)
+        descended(best, 2 * each, self.rate / (self.relocations + 1), _SLOWEST * self.rate)
+        return best
 
 
 def _start(descent: Descent, journal: Journal, count: int, seed: int) -> Probes:
@@ -197,9 +199,3 @@ def _with_footprints(descent: Descent, position: np.ndarray) -> Probes:
     if descent.interpolation == "tetrahedra":
         return Probes(position)
     return Probes(position, isotropic_metric(torch.as_tensor(position)).numpy())
-
-
-def _placement(journal: Journal, descent: Descent, probes: Probes, details: dict[str, Any]) -> Placement:
-    reader = ProbeReader(descent.interpolation, probes.metric, descent.neighbours, descent.sight)
-    radiance = None if descent.reconstruction.content == "field" else descent.content(probes)
-    return journal.placement(probes.position, radiance=radiance, reader=reader, **details)

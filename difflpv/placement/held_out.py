@@ -20,13 +20,11 @@ from data_gen.freespace import is_free
 from data_gen.load import TargetsError
 from data_gen.probe_content import trace_probes
 from data_gen.probe_targets import ProbeTargets
-from difflpv.placement.from_targets import placement_task, split_points
-from difflpv.placement.reconstruction import fitted_content
+from difflpv.placement.from_targets import light_channels, placement_task, split_points
+from difflpv.placement.reconstruction import fitted_content, irradiance_coordinates
 from difflpv.placement.task import PlacementTask
-from difflpv.probes.probe_set import DIRECTIONS_26
 from difflpv.probes.reader import ProbeReader
 from difflpv.scene import Scene
-from difflpv.sh import cosine_lobe
 
 __all__ = ["BAKED_CONTENTS", "BakedContent", "HeldOut"]
 
@@ -112,7 +110,7 @@ class HeldOut:
         sets = [self.targets.light_sets[k] for k in self.lights]
         options = {"component": self.targets.component, "spp": spp, "seed": seed, "workers": workers, "progress": False}
         found = trace_probes(self.scene, position, light_sets=sets, **options).mean  # type: ignore[arg-type]
-        return torch.as_tensor(np.moveaxis(found, 0, 2).reshape(len(position), found.shape[2], -1))
+        return torch.as_tensor(light_channels(found))
 
     def fitted(self, position: np.ndarray, reader: ProbeReader, traced: torch.Tensor) -> torch.Tensor:
         """Content by least squares over the points of ``fit`` with a pull toward ``traced`` [n,9,C] W/m2."""
@@ -131,10 +129,9 @@ class HeldOut:
 
 
 def _noise(targets: ProbeTargets, lights: list[int], points: np.ndarray) -> float:
-    # over these 26 directions products of different basis functions add up to 0: the squares are all there is
-    weight = (cosine_lobe(DIRECTIONS_26, 2) ** 2).sum(0)[:, None]
+    # a sum of squares: the noise of different coefficients adds up like their values
     spread, value = (
-        float((weight * part[lights][:, points].astype(np.float64) ** 2).sum())
+        irradiance_coordinates(torch.as_tensor(light_channels(part[lights][:, points])))
         for part in (targets.standard_error, targets.radiance)
     )
-    return float(np.sqrt(spread / value)) if value > 0 else 0.0
+    return float(spread.norm() / value.norm()) if bool(value.any()) else 0.0

@@ -8,7 +8,7 @@ import torch
 
 from difflpv.placement.task import PlacementTask
 from difflpv.probes.rows import Rows
-from difflpv.probes.visible import VisibleInterpolation
+from difflpv.probes.visible import Sight
 
 __all__ = ["Penalties"]
 
@@ -20,7 +20,7 @@ class Penalties:
     Attributes:
         barrier: mean over probes of ((margin - clearance)+ / margin)^2: keeps probes off surfaces.
         margin: distance to surfaces that the barrier asks for [m]; 1 % of the longest edge of the points' box if None.
-        leak: share of the weight with which points read probes that they do not see (smooth sight of ``VisibleInterpolation``).
+        leak: share of the weight with which points read probes that they do not see (smooth ``Sight``).
         coverage: mean over points of ((d - reach)+ / reach)^2 with d the distance to the nearest probe: a minimum density.
         reach: how far from a probe a point may be [m]; needed for ``coverage``.
     """
@@ -43,7 +43,7 @@ class Penalties:
             raise ValueError("penalty coverage: expected a reach [m] as well, got none")
 
     def total(
-        self, task: PlacementTask, position: torch.Tensor, rows: Rows, sight: VisibleInterpolation | None
+        self, task: PlacementTask, position: torch.Tensor, rows: Rows, sight: Sight | None
     ) -> torch.Tensor:
         """The sum, a scalar, for probes at ``position`` [n,3] m read by ``rows``; ``sight`` is needed for ``leak``."""
         found = position.new_zeros(())

@@ -7,6 +7,7 @@ import torch
 
 from difflpv.placement.descent import Descent, Probes
 from difflpv.probes.gaussian import isotropic_metric
+from difflpv.probes.rows import Rows
 
 __all__ = ["removal_damage", "with_spawned", "without_least"]
 
@@ -16,29 +17,34 @@ def removal_damage(descent: Descent, probes: Probes) -> np.ndarray:
 
     Relative to the square of the truth. The others keep what they hold; fitted anew, the damage is smaller.
     """
-    rows, held, found = descent.read(probes)
+    return _damage(descent, len(probes), *descent.read(probes))
+
+
+def _damage(descent: Descent, count: int, rows: Rows, held: torch.Tensor, found: torch.Tensor) -> np.ndarray:
     truth, task = descent.reconstruction.truth, descent.task
     before = (found - truth).square().sum(1)
-    damage = torch.zeros(len(probes), dtype=torch.float64)
+    damage = torch.zeros(count, dtype=torch.float64)
     for probe, weight in zip(rows.probe.T, rows.weight.T[:, :, None], strict=True):
         rest = (found - weight * held[probe]) / (1 - weight).clamp_min(1e-3)
         damage.index_add_(0, probe, task.weights * ((rest - truth).square().sum(1) - before))
     return (damage / (task.weights[:, None] * truth.square()).sum()).numpy()
 
 
-def without_least(descent: Descent, probes: Probes, count: int, *, merge: bool = True) -> Probes:
+def without_least(descent: Descent, probes: Probes, count: int) -> Probes:
     """The probes without the ``count`` whose removal does least damage, no two of which are neighbours where that can be.
+
+    What goes is merged into the nearest probe that stays: where nothing is in the way, this one moves to the middle of the
+    two, by the weights they are read with.
 
     Args:
         descent: says what points read.
         probes: more than ``count``.
         count: how many go.
-        merge: the nearest probe that stays and sees a removed one moves to the middle of the two, by the weights they are
-            read with.
     """
     from scipy.spatial import KDTree
 
-    order = np.argsort(removal_damage(descent, probes), kind="stable")
+    rows, held, found = descent.read(probes)
+    order = np.argsort(_damage(descent, len(probes), rows, held, found), kind="stable")
     position = np.array(probes.position)
     tree = KDTree(position)
     gone = np.zeros(len(probes), bool)
@@ -50,16 +56,14 @@ def without_least(descent: Descent, probes: Probes, count: int, *, merge: bool =
             if not gone[probe] and not (strict and touched[probe]):
                 gone[probe] = True
                 touched[tree.query(position[probe], min(3, len(probes)))[1]] = True
-    if merge and not gone.all():
-        rows = descent.read(probes)[0]
-        load = torch.zeros(len(probes), dtype=torch.float64)
-        load.index_add_(0, rows.probe.flatten(), rows.weight.flatten())
-        stay = np.flatnonzero(~gone)
-        for probe in np.flatnonzero(gone):
-            other = stay[np.linalg.norm(position[stay] - position[probe], axis=1).argmin()]
-            share = float(load[probe] / (load[probe] + load[other]).clamp_min(1e-9))
-            wanted = position[other] + share * (position[probe] - position[other])
-            position[other] = descent.moves.moved(position[other][None], wanted[None])[0][0]
+    load = torch.zeros(len(probes), dtype=torch.float64)
+    load.index_add_(0, rows.probe.flatten(), rows.weight.flatten())
+    stay = np.flatnonzero(~gone)
+    for probe in np.flatnonzero(gone):
+        other = stay[np.linalg.norm(position[stay] - position[probe], axis=1).argmin()]
+        share = float(load[probe] / (load[probe] + load[other]).clamp_min(1e-9))
+        wanted = position[other] + share * (position[probe] - position[other])
+        position[other] = descent.moves.moved(position[other][None], wanted[None])[0][0]
     return Probes(position, probes.metric).kept(np.flatnonzero(~gone))
 
 

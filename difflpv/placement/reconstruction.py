@@ -16,7 +16,7 @@ from difflpv.sh import cosine_lobe
 __all__ = ["Content", "Reconstruction", "fitted_content", "irradiance_coordinates", "reconstruction_error", "relative_error"]
 
 Content = Literal["field", "fitted"]
-RIDGE = 0.02
+_RIDGE = 0.02
 _LOBES = cosine_lobe(DIRECTIONS_26, 2)
 _FACTOR = torch.from_numpy(np.linalg.cholesky(_LOBES.T @ _LOBES))
 
@@ -27,7 +27,7 @@ def irradiance_coordinates(radiance: torch.Tensor) -> torch.Tensor:
 
 
 def fitted_content(
-    task: PlacementTask, position: torch.Tensor, rows: Rows, *, ridge: float = RIDGE, toward: torch.Tensor | None = None
+    task: PlacementTask, position: torch.Tensor, rows: Rows, *, ridge: float = _RIDGE, toward: torch.Tensor | None = None
 ) -> torch.Tensor:
     """Radiance SH [n,9,C] W/m2 that reconstructs the task's points best, differentiable in positions and weights.
 
@@ -54,7 +54,7 @@ class Reconstruction:
     """
 
     def __init__(
-        self, task: PlacementTask, content: Content = "field", *, ridge: float = RIDGE, kept: float = 1.0
+        self, task: PlacementTask, content: Content = "field", *, ridge: float = _RIDGE, kept: float = 1.0
     ) -> None:
         """Take the truth.
 
@@ -107,7 +107,7 @@ def reconstruction_error(
     *,
     content: Content = "field",
     interpolation: Interpolation | None = None,
-    ridge: float = RIDGE,
+    ridge: float = _RIDGE,
 ) -> torch.Tensor:
     """Relative L2 error of irradiance over 26 normals at the task's points, a scalar, differentiable in ``position``.
 

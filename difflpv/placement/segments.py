@@ -73,7 +73,7 @@ class Segments:
             since += 1
 
         start = time.perf_counter()
-        result, error = descent.run(probes, steps, rate=lambda done: first + done * (last - first), told=told)
+        result, error = descent.run(probes, steps, first, last, told=told)
         self.journal.evaluations += _evaluations(steps)
         metric = None if result.metric is None else torch.from_numpy(result.metric)
         seconds = time.perf_counter() - start

@@ -95,8 +95,7 @@ class PlacementTask:
         near = points[self._tree.query(position, witnesses)[1]].reshape(len(position), witnesses, 3)
         there = np.broadcast_to(position[:, None], near.shape).reshape(-1, 3)
         ends = near.reshape(-1, 3)
-        # looked at from both ends: a ray may miss a surface that it starts on
-        hidden = self.raycaster.blocked(ends, there, shortened=False) | self.raycaster.blocked(there, ends, shortened=False)
+        hidden = self.raycaster.blocked_from_either_end(ends, there)
         return np.asarray(~hidden.reshape(len(position), witnesses).all(1))
 
     @cached_property

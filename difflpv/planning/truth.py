@@ -96,6 +96,8 @@ class HeldOutTruth:
                 raise ValueError(f"levels: expected receivers and lights that never become fewer, got {level} after {before}")
         self.scene, self.component, self.light_sets = scene, component, list(light_sets)
         self.folder, self.levels, self.seed, self.workers = Path(folder), tuple(levels), seed, workers
+        counts = [0, *(level.receivers for level in levels)]
+        self._fresh = np.diff(counts).tolist()  # receivers that each level adds
         self._parts: dict[int, _Part] = {}
         self._lit: dict[int, Scene] = {}
 
@@ -115,8 +117,7 @@ class HeldOutTruth:
         Raises:
             ValueError: a component without light under all the sets.
         """
-        fresh = [v.receivers - before for v, before in zip(self.levels, [0, *(v.receivers for v in self.levels)], strict=False)]
-        sets, parts = self._sets(self.levels[level].lights), [p for p in range(level + 1) if fresh[p]]
+        sets, parts = self._sets(self.levels[level].lights), [p for p in range(level + 1) if self._fresh[p]]
         for part in parts:
             self._trace(part, [number for number in sets if number not in self._part(part).irradiance])
         found = [self._part(part) for part in parts]
@@ -124,7 +125,7 @@ class HeldOutTruth:
         def joined(tables: Sequence[dict[int, np.ndarray]]) -> np.ndarray:
             return np.stack([np.concatenate([table[number] for table in tables]) for number in sets])
 
-        shares = [fresh[part] / sum(fresh[: level + 1]) for part in parts]  # each part stands for the whole area
+        shares = [self._fresh[part] / self.levels[level].receivers for part in parts]  # each part stands for the whole area
         weights = [{k: w * share for k, w in part.weight.items()} for part, share in zip(found, shares, strict=True)]
         irradiance, error = joined([p.irradiance for p in found]), joined([p.standard_error for p in found])
         return LevelTruth(tuple(parts), tuple(sets), irradiance, error, joined(weights))
@@ -144,8 +145,7 @@ class HeldOutTruth:
 
     def _part(self, part: int) -> _Part:
         if part not in self._parts:
-            count = self.levels[part].receivers - (self.levels[part - 1].receivers if part else 0)
-            drawn = draw_receivers(self.scene, count, self._seed(part), within=grid_for(self.scene))
+            drawn = draw_receivers(self.scene, self._fresh[part], self._seed(part), within=grid_for(self.scene))
             self._parts[part] = _Part(drawn)
         return self._parts[part]
 

@@ -11,7 +11,7 @@ import torch
 from difflpv.probes.gaussian import GaussianInterpolation
 from difflpv.probes.rows import Interpolation
 from difflpv.probes.tetrahedra import TetrahedralInterpolation
-from difflpv.probes.visible import VisibleInterpolation
+from difflpv.probes.visible import Sight, VisibleInterpolation
 from difflpv.raycast import Raycaster
 from difflpv.scene import Scene
 
@@ -71,4 +71,4 @@ class ProbeReader:
             inner = TetrahedralInterpolation(position)
         else:
             inner = GaussianInterpolation(torch.tensor(self.metric), neighbours=self.neighbours)
-        return VisibleInterpolation(inner, scene, raycaster=raycaster) if self.sight else inner
+        return VisibleInterpolation(inner, Sight(scene, raycaster=raycaster)) if self.sight else inner

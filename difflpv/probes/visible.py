@@ -20,8 +20,6 @@ too, the planes being held; finer occluders than the map's step (11 degrees for 
 
 from __future__ import annotations
 
-import copy
-
 import numpy as np
 import torch
 
@@ -30,34 +28,30 @@ from difflpv.probes.rows import Interpolation, Rows
 from difflpv.raycast import Raycaster
 from difflpv.scene import Scene
 
-__all__ = ["VisibleInterpolation"]
+__all__ = ["Sight", "VisibleInterpolation"]
 
 _NEAR = 1e-6  # m; a probe this close to a receiver has no direction
 _UNKNOWN, _MISS = -2, -1
 
 
-class VisibleInterpolation:
-    """The weights of another interpolation, multiplied by how far a receiver sees each probe (see the module)."""
+class Sight:
+    """How far receivers see probes: V of the module. What receivers saw is kept as long as they stay where they are."""
 
     def __init__(
         self,
-        inner: Interpolation,
         scene: Scene,
         *,
         raycaster: Raycaster | None = None,
         softness: float | None = None,
         resolution: int = 16,
-        floor: float = 1e-3,
     ) -> None:
-        """Wrap.
+        """Set up; nothing is traced before it is asked for.
 
         Args:
-            inner: whose weights are multiplied.
             scene: its triangles block, from either side.
             raycaster: over the scene; made, if None.
             softness: s of the module [m]; 0.005 of the scene's extent, if None.
             resolution: R of the module: R x R directions around a receiver, each held with 4 bytes once it was traced.
-            floor: f of the module: what an unseen probe counts, relative to a seen one.
 
         Raises:
             ValueError: naming the argument, what was expected and what came.
@@ -68,9 +62,7 @@ class VisibleInterpolation:
             raise ValueError(f"softness: expected a length > 0 m, got {softness}")
         if resolution < 2:
             raise ValueError(f"resolution: expected at least 2 directions a side, got {resolution}")
-        if not 0 < floor <= 1:
-            raise ValueError(f"floor: expected a number in (0, 1], got {floor}")
-        self._inner, self._floor, self._resolution = inner, floor, resolution
+        self._resolution = resolution
         self._raycaster = Raycaster(scene) if raycaster is None else raycaster
         side = (np.arange(resolution) + 0.5) / resolution * 2 - 1
         self._direction = _direction_at(np.stack(np.meshgrid(side, side, indexing="ij"), -1).reshape(-1, 2))
@@ -78,26 +70,8 @@ class VisibleInterpolation:
         normal = scene.triangle_normals
         through = (normal * scene.triangle_vertices[:, 0]).sum(1)
         self._normal, self._through = torch.from_numpy(normal), torch.from_numpy(through)
-        self._memory = _Memory()
-
-    def around(self, inner: Interpolation) -> VisibleInterpolation:
-        """The same eyes over another interpolation; what receivers saw is shared by both."""
-        other = copy.copy(self)
-        other._inner = inner
-        return other
-
-    def rows(self, position: torch.Tensor, points: torch.Tensor) -> Rows:
-        """Weights of ``points`` [m,3] m, off every surface, over probes at ``position`` [n,3] m; differentiable in both.
-
-        Raises:
-            TypeError, ValueError: naming the argument, what was expected and what came.
-        """
-        check_points("position", position)
-        check_points("points", points, like=position)
-        rows = self._inner.rows(position, points)
-        share = self._floor + (1 - self._floor) * self.visibility(position, points, rows.probe)
-        weight = rows.weight * share
-        return Rows(rows.probe, weight / weight.sum(1, keepdim=True))
+        self._receivers = np.empty((0, 3))
+        self._seen = np.empty((0, resolution**2), np.int32)
 
     def visibility(self, position: torch.Tensor, points: torch.Tensor, probe: torch.Tensor) -> torch.Tensor:
         """How far ``points`` [m,3] m see the probes [m,k] that they name, in [0, 1]: V of the module."""
@@ -128,11 +102,10 @@ class VisibleInterpolation:
 
     def _look(self, points: np.ndarray, tap: np.ndarray) -> np.ndarray:
         """Triangle [m,k,4] that each point sees along each texel's direction, -1 for none; traced once for each place."""
-        memory = self._memory
-        if not np.array_equal(points, memory.receivers):
-            memory.receivers = points.copy()
-            memory.seen = np.full((len(points), self._resolution**2), _UNKNOWN, np.int32)
-        seen = memory.seen
+        if not np.array_equal(points, self._receivers):
+            self._receivers = points.copy()
+            self._seen = np.full((len(points), self._resolution**2), _UNKNOWN, np.int32)
+        seen = self._seen
         receiver = np.broadcast_to(np.arange(len(points))[:, None, None], tap.shape)
         wanted = np.zeros(seen.shape, bool)
         wanted[receiver, tap] = True
@@ -142,12 +115,36 @@ class VisibleInterpolation:
         return seen[receiver, tap].astype(np.int64)
 
 
-class _Memory:
-    """What receivers [m,3] saw: the triangle of each texel [m,R*R], or that it is not known yet."""
+class VisibleInterpolation:
+    """The weights of another interpolation, multiplied by how far a receiver sees each probe (see the module)."""
 
-    def __init__(self) -> None:
-        self.receivers = np.empty((0, 3))
-        self.seen = np.empty((0, 0), np.int32)
+    def __init__(self, inner: Interpolation, sight: Sight, *, floor: float = 1e-3) -> None:
+        """Wrap.
+
+        Args:
+            inner: whose weights are multiplied.
+            sight: how far receivers see; several interpolations may share one, and what was seen with it.
+            floor: f of the module: what an unseen probe counts, relative to a seen one.
+
+        Raises:
+            ValueError: naming the argument, what was expected and what came.
+        """
+        if not 0 < floor <= 1:
+            raise ValueError(f"floor: expected a number in (0, 1], got {floor}")
+        self._inner, self._sight, self._floor = inner, sight, floor
+
+    def rows(self, position: torch.Tensor, points: torch.Tensor) -> Rows:
+        """Weights of ``points`` [m,3] m, off every surface, over probes at ``position`` [n,3] m; differentiable in both.
+
+        Raises:
+            TypeError, ValueError: naming the argument, what was expected and what came.
+        """
+        check_points("position", position)
+        check_points("points", points, like=position)
+        rows = self._inner.rows(position, points)
+        share = self._floor + (1 - self._floor) * self._sight.visibility(position, points, rows.probe)
+        weight = rows.weight * share
+        return Rows(rows.probe, weight / weight.sum(1, keepdim=True))
 
 
 def _direction_at(uv: np.ndarray) -> np.ndarray:

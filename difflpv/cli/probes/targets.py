@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from difflpv.cli.options import UsageError, add_command, add_output, light_sets, positive, seeded
-from difflpv.cli.output import print_json, warn
+from difflpv.cli.output import last_change, print_json, warn
 
 if TYPE_CHECKING:
     from data_gen.probe_targets import ProbeTargets
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
         warnings.append(f"--lights {args.lights}: scene '{scene.name}' has only {len(sets)} different light set(s)")
     warn(warnings)
     manifest = args.out / MANIFEST
-    before = manifest.stat().st_mtime_ns if manifest.is_file() else None
+    before = last_change(manifest)
     targets = make_probe_targets(
         scene,
         args.out,
@@ -91,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
         overwrite=args.overwrite,
         progress=False if args.json else None,
     )
-    recognised = manifest.stat().st_mtime_ns == before
+    recognised = last_change(manifest) == before
     if args.json:
         print_json(_record(targets) | {"recognised": recognised, "warnings": warnings})
     else:
