@@ -9,13 +9,13 @@ from __future__ import annotations
 import numpy as np
 
 from data_gen.components import Components
-from data_gen.distance import triangle_distance
 from data_gen.estimators import probe_block
 from data_gen.pathtracer import PathTracer
 from data_gen.receivers import grey_twin
 from data_gen.rng import generator
 from data_gen.samplers import uniform_sphere
 from difflpv.scene import Scene
+from difflpv.triangle_distance import triangle_distance
 
 __all__ = ["default_clearance", "draw_probes", "is_free"]
 
@@ -41,7 +41,7 @@ def is_free(scene: Scene, points: np.ndarray, seed: int = 0) -> np.ndarray:
         seed: of the rays. A point decides on 64 paths and 64 rays of its own.
 
     Returns:
-        Shape [n] bool. The distance to surfaces is no part of it: see ``data_gen.distance.triangle_distance``.
+        Shape [n] bool. The distance to surfaces is no part of it: see ``difflpv.triangle_distance.triangle_distance``.
     """
     return _free(PathTracer(grey_twin(scene)), np.asarray(points, np.float64).reshape(-1, 3), seed, attempt=0)
 

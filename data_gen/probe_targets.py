@@ -18,7 +18,6 @@ import numpy as np
 
 from data_gen.blocks import BlockRunner, BlockStore, Job, JobPart, Quantity, round_samples
 from data_gen.components import Components, Estimate
-from data_gen.distance import triangle_distance
 from data_gen.estimators import REPLICATES
 from data_gen.freespace import default_clearance, draw_probes, is_free
 from data_gen.load import FORMAT, TargetsError, check_files, check_made_for
@@ -31,6 +30,7 @@ from difflpv.grid import Grid
 from difflpv.io.tables import TableError, load_table, save_table
 from difflpv.raycast import Raycaster
 from difflpv.scene import Scene
+from difflpv.triangle_distance import triangle_distance
 
 __all__ = ["ProbeTargets", "load_probe_targets", "make_probe_targets"]
 

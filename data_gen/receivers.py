@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from data_gen.components import Components
-from data_gen.distance import triangle_distance
 from data_gen.estimators import REPLICATES, irradiance_block
 from data_gen.pathtracer import PathTracer
 from data_gen.rng import generator
@@ -27,6 +26,7 @@ from data_gen.samplers import cosine_hemisphere, rotate_to, triangle_barycentric
 from difflpv.grid import Grid
 from difflpv.io.tables import ReceiverTable
 from difflpv.scene import Mesh, Scene
+from difflpv.triangle_distance import triangle_distance
 
 __all__ = ["draw_receivers", "grey_twin"]
 

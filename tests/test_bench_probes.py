@@ -7,7 +7,6 @@ import pytest
 import torch
 from hand_scenes import box_scene, box_walls
 
-from data_gen.distance import triangle_distance
 from data_gen.freespace import default_clearance, is_free
 from difflpv.bench.configuration import Configuration, chosen
 from difflpv.bench.measure import errors, measure, prepare
@@ -18,6 +17,7 @@ from difflpv.probes.lookup import probe_irradiance
 from difflpv.probes.rows import Rows
 from difflpv.sampling import sample_irradiance
 from difflpv.scene import AreaLight, Scene
+from difflpv.triangle_distance import triangle_distance
 
 TRACED, LIT = "probes 64, path-traced", "probes 64, LPV-lit, 16 cells"
 

@@ -120,10 +120,13 @@ def test_another_request_replaces_only_when_asked_to(room, tmp_path, capsys) -> 
 
 def test_ends_with_few_probes_where_few_meet_the_tolerance(room, tmp_path, capsys) -> None:
     options = ("--steps", 4, "--relocations", 0, "--tolerance", 0.99, "--count", 30)
-    assert placed(room, tmp_path / "few", *options) == 0
-    assert "tolerance 0.99 met: error 0." in capsys.readouterr().out
+    assert placed(room, tmp_path / "few", *options, "--lights", "0-1") == 0
+    text = capsys.readouterr().out
+    assert "tolerance 0.99 met: error 0." in text and "95% confidence, under lights that placed, too few" in text
     record = load_probes(tmp_path / "few")
     assert len(record.probes) < 8 and record.provenance["details"]["held_out_error"] <= 0.99
+    assert placed(room, tmp_path / "unseen", *options, "--tolerance", 0.01, "--count", 8) == 0
+    assert "confidence, under 1 light set(s) held out" in capsys.readouterr().out
 
 
 def test_options_reach_the_placement(room, tmp_path) -> None:

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from data_gen.distance import triangle_distance
 from data_gen.freespace import draw_probes
 from data_gen.receivers import draw_receivers
 from difflpv.io import load_scene
 from difflpv.scene import AreaLight, Material, Mesh, Scene
+from difflpv.triangle_distance import triangle_distance
 
 
 def box(name, low, high, *, inside_out=False):

@@ -120,6 +120,16 @@ def test_bounds_hold_as_often_as_they_say():
     assert 180 - 3.5 * math.sqrt(200 * 0.9 * 0.1) <= inside <= 180 + 3.5 * math.sqrt(200 * 0.9 * 0.1)
 
 
+def test_drawn_cases_bound_what_two_cases_of_one_kind_would_have():
+    """Without scatter among receivers, two draws of two cases are alike half of the time: the bounds are the cases' errors."""
+    truth = np.ones((2, 50, 3))
+    samples = ErrorSamples.of(truth * [[[1.1]], [[1.4]]], truth, 0 * truth, np.ones((2, 50)))
+    e = samples.estimate(draw_cases=True)
+    assert (e.low, e.error, e.high) == pytest.approx((0.1, math.sqrt((0.01 + 0.16) / 2), 0.4))
+    e = samples.estimate()
+    assert e.low == pytest.approx(e.high)
+
+
 def test_the_ladder_names_each_rung_once_and_orders_work():
     assert len({rung.name for rung in PLAN_LADDER}) == len(PLAN_LADDER)
     grid = grid_for(load_scene("cornell"), 16)

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from data_gen.distance import triangle_distance
 from data_gen.few_paths import PathPool
 from data_gen.freespace import default_clearance, is_free
 from difflpv.bench.configuration import Configuration
@@ -27,6 +26,7 @@ from difflpv.probes.probe_set import COEFFS
 from difflpv.probes.rows import Rows
 from difflpv.probes.tetrahedra import TetrahedralInterpolation
 from difflpv.scene import Scene
+from difflpv.triangle_distance import triangle_distance
 
 __all__ = ["LitProbes", "ProbeRun", "TracedProbes"]
 

@@ -12,7 +12,7 @@ import torch
 
 from difflpv.placement.free_moves import FreeMoves
 from difflpv.placement.penalties import Penalties
-from difflpv.placement.reconstruction import Reconstruction, fitted_content, relative_error
+from difflpv.placement.reconstruction import Reconstruction, fitted_content
 from difflpv.placement.task import PlacementTask
 from difflpv.probes.gaussian import GaussianInterpolation
 from difflpv.probes.reader import InterpolationName, ProbeReader
@@ -103,14 +103,6 @@ class Descent:
         position, metric = _tensors(probes)
         rows = self.reader(position, metric).rows(position, self.task.points)
         return fitted_content(self.task, position, rows, ridge=self.reconstruction.ridge).numpy()
-
-    @torch.no_grad()
-    def error_at(self, probes: Probes, judge: PlacementTask) -> float:
-        """Relative L2 error at another task's points, with the content fitted to this one's (or the field's)."""
-        position, _ = _tensors(probes)
-        held = torch.as_tensor(self.content(probes)) if self.reconstruction.content == "fitted" else judge.field(position)
-        reader = self.settled(probes).over(probes.position, judge.scene, raycaster=self.task.raycaster)
-        return float(relative_error(judge, reader.rows(position, judge.points).apply(held)))
 
     def run(
         self, probes: Probes, steps: int, first: float, last: float, *, told: Callable[[float], None] | None = None

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from difflpv.placement.descent import Descent, Probes
-from difflpv.placement.fewest import fewest, held_out_points
+from difflpv.placement.fewest import fewest
 from difflpv.placement.free_moves import FreeMoves, Region
 from difflpv.placement.journal import Journal
 from difflpv.placement.penalties import Penalties
@@ -26,6 +26,7 @@ from difflpv.placement.reconstruction import Content, Reconstruction
 from difflpv.placement.segments import Segments, task_digest
 from difflpv.placement.task import Placement, PlacementTask, Progress
 from difflpv.placement.uniform import SPREADS, uniform_grids
+from difflpv.placement.unseen import Unseen
 from difflpv.probes.gaussian import isotropic_metric
 from difflpv.probes.reader import InterpolationName
 
@@ -57,7 +58,9 @@ def place_gradient(
     coverage: float = 0.0,
     reach: float | None = None,
     regions: Sequence[Region] = (),
+    clearance: float | None = None,
     tolerance: float | None = None,
+    confidence: float = 0.95,
     checkpoint: str | Path | None = None,
 ) -> Placement:
     """Move probes down the gradient of the reconstruction error.
@@ -84,7 +87,10 @@ def place_gradient(
         coverage: weight of a minimum density.
         reach: farthest that a point may be from a probe [m], for ``coverage``.
         regions: boxes that probes may stand in; the box of the points if empty.
-        tolerance: if given, end with the fewest probes whose error at points that were held out meets it.
+        clearance: least distance of probes to any triangle [m]; see ``FreeMoves``.
+        tolerance: if given, end with the fewest probes whose error meets it at points and under lights that were held out
+            (``Unseen``).
+        confidence: with which that error is below the tolerance, in [0.5, 1).
         checkpoint: file that is written after each part and read when the same work is started again; None for none.
 
     Returns:
@@ -101,18 +107,21 @@ def place_gradient(
         )
     if tolerance is not None and not 0 < tolerance < 1:
         raise ValueError(f"gradient tolerance: expected a relative error between 0 and 1, got {tolerance}")
+    if not 0.5 <= confidence < 1:
+        raise ValueError(f"gradient confidence: expected a number in [0.5, 1), got {confidence}")
     journal = Journal(task, "gradient", count, progress)
     penalties = Penalties(barrier=barrier, margin=margin, leak=leak, coverage=coverage, reach=reach)
 
     def descent_on(part: PlacementTask) -> Descent:
         error = Reconstruction(part, content, ridge=ridge, kept=_KEPT)
-        return Descent(error, penalties, FreeMoves(task, regions), interpolation, neighbours, sight)
+        return Descent(error, penalties, FreeMoves(task, regions, clearance=clearance), interpolation, neighbours, sight)
 
     identity = {
         "task": task_digest(task), "count": count, "seed": seed, "interpolation": interpolation, "content": content,
         "sight": sight, "neighbours": neighbours, "steps": steps, "relocations": relocations, "share": share, "rate": rate,
         "ridge": ridge, "barrier": barrier, "margin": margin, "leak": leak, "coverage": coverage, "reach": reach,
         "regions": [[list(map(float, corner)) for corner in region] for region in regions], "tolerance": tolerance,
+        "clearance": clearance, "confidence": confidence,
     }  # fmt: skip
     segments = Segments(journal, checkpoint, identity)
     work = _Work(segments, steps, relocations, share, rate, seed)
@@ -121,8 +130,10 @@ def place_gradient(
         if tolerance is None:
             work.placed(descent_on(task), count)
         else:
-            train, judge = held_out_points(task)
-            details |= fewest(descent_on(train), judge, work.placed, segments, most=count, tolerance=tolerance)
+            unseen = Unseen.of(task)
+            details |= fewest(
+                descent_on(unseen.train), unseen, work.placed, segments, most=count, tolerance=tolerance, confidence=confidence
+            )
     except KeyboardInterrupt:
         if segments.best is None:
             raise

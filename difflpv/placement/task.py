@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -15,6 +15,7 @@ from difflpv.probes.probe_set import COEFFS
 from difflpv.probes.reader import ProbeReader
 from difflpv.raycast import Raycaster
 from difflpv.scene import Scene
+from difflpv.triangle_distance import TriangleDistance
 
 __all__ = ["Placement", "PlacementTask", "Progress"]
 
@@ -71,20 +72,43 @@ class PlacementTask:
         """Rays against the scene's triangles."""
         return Raycaster(self.scene)
 
+    @cached_property
+    def surface_distance(self) -> TriangleDistance:
+        """Exact distance to the scene's triangles."""
+        return TriangleDistance(self.scene.triangle_vertices)
+
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lowest and highest corner [3] m of the box around the points: the working volume of the thesis (3.1.1)."""
         points = self.points.numpy()
         return points.min(0), points.max(0)
 
-    def in_free_space(self, position: np.ndarray, margin: float = 0.0, *, seen: bool = True) -> np.ndarray:
+    def part(self, *, points: torch.Tensor | None = None, lights: Sequence[int] | None = None) -> PlacementTask:
+        """What the task knows of some points (indices or booleans [m]; all if None) under some lights (all if None)."""
+        points = torch.arange(len(self.points)) if points is None else points
+        number = torch.tensor(range(self.light_count) if lights is None else lights, dtype=torch.long)
+        channels = (3 * number[:, None] + torch.arange(3)).flatten()
+        return replace(
+            self,
+            points=self.points[points],
+            radiance=self.radiance[points][..., channels],
+            field=LatticeField(self.field.grid, self.field.values[..., channels]),
+            weight=None if self.weight is None else self.weight[points],
+        )
+
+    @property
+    def light_count(self) -> int:
+        """Light sets."""
+        return self.radiance.shape[2] // 3
+
+    def in_free_space(self, position: np.ndarray, margin: float = 0.0) -> np.ndarray:
         """True for positions [n,3] m at least ``margin`` m off every surface and in no solid.
 
-        The clearance lattice says so, and, unless it is not asked for, one of the nearest points that sees the position: the
-        lattice misses walls that are thinner than its cells.
+        The clearance lattice says so, and one of the nearest points that sees the position: the lattice misses walls that are
+        thinner than its cells.
         """
         free: np.ndarray = (self.clearance(torch.as_tensor(position, dtype=torch.float64)) > margin).numpy()
-        if seen and free.any():
+        if free.any():
             free[free] = self.seen(np.asarray(position, np.float64)[free])
         return free
 

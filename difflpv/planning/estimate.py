@@ -6,7 +6,8 @@ Error of cases (light sets) j with receivers i of weight w:
 
 with s^2 the truth's variance: what it adds to the squares on average is taken off above and below, so that a perfect
 prediction has error 0 for any number of paths. Its bounds are quantiles of a bootstrap over receivers (each drawn with all
-its cases), so they hold the scatter of the truth's noise too; they say nothing about lights that are not among the cases.
+its cases), so they hold the scatter of the truth's noise too. They say nothing about lights that are not among the cases,
+unless cases are drawn as well.
 """
 
 from __future__ import annotations
@@ -62,13 +63,17 @@ class ErrorSamples:
         squared = ((found - truth).astype(float) ** 2).sum(-1) - variance
         return cls(weight * squared, weight * ((truth.astype(float) ** 2).sum(-1) - variance))
 
-    def estimate(self, *, confidence: float = 0.95, seed: int = 0) -> Estimate:
-        """The error and its bounds, each one-sided with ``confidence``."""
+    def estimate(self, *, confidence: float = 0.95, seed: int = 0, draw_cases: bool = False) -> Estimate:
+        """The error and its bounds, each one-sided with ``confidence``; of so many other cases with ``draw_cases``."""
         if not 0.5 <= confidence < 1:
             raise ValueError(f"confidence: expected a number in [0.5, 1), got {confidence}")
         draws = _draws(self.squared.shape[1], seed)
         power = np.maximum(draws @ self.power.T, 1e-300)
-        spread = np.sqrt(np.maximum((draws @ self.squared.T / power).mean(1), 0))
+        each = draws @ self.squared.T / power
+        if draw_cases:
+            count = len(self.squared)
+            each *= np.random.default_rng([seed, 1]).multinomial(count, np.full(count, 1 / count), size=len(draws))
+        spread = np.sqrt(np.maximum(each.mean(1), 0))
         error = float(np.sqrt(max(0.0, float((self.squared.sum(1) / np.maximum(self.power.sum(1), 1e-300)).mean()))))
         low, high = np.quantile(spread, [1 - confidence, confidence])
         return Estimate(error, min(error, float(low)), max(error, float(high)))

@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 
-from data_gen.distance import triangle_distance
 from data_gen.targets import make_targets
 from difflpv.grid import Grid
 from difflpv.io.tables import ReceiverTable
 from difflpv.scene import AreaLight, Material, Mesh, Scene
+from difflpv.triangle_distance import triangle_distance
 
 __all__ = ["ROOM_CELLS", "TrainingRoom", "draw_room", "traced_room"]
 

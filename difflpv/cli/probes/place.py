@@ -92,8 +92,9 @@ def add_parser(subparsers: Any) -> None:
     )
     own.add_argument("--sight", action="store_true", help="points read only probes that they see")
     own.add_argument(
-        "--tolerance", type=fraction, metavar="E", help="end with the fewest probes whose error at held-out points meets it"
-    )
+        "--tolerance", type=fraction, metavar="E",
+        help="end with the fewest probes whose error meets it at points and under lights that are held out",
+    )  # fmt: skip
     own.add_argument("--steps", type=positive, metavar="N", help="of descent (default: 300)")
     own.add_argument("--relocations", type=natural, metavar="N", help="of probes in between (default: 3)")
     own.add_argument("--leak", type=natural_float, metavar="W", help="weight of reading through walls (default: 0)")
@@ -296,7 +297,12 @@ def _text(out: Path, record: ProbeRecord, recognised: bool) -> str:
     details = known["details"]
     if "met" in details:
         met = "met" if details["met"] else "not met"
-        lines.append(f"tolerance {details['tolerance']:g} {met}: error {details['held_out_error']:.4f} at points held out")
+        lights = len(details["lights_held_out"])
+        under = f"{lights} light set(s) held out" if lights else "lights that placed, too few to hold some out"
+        lines.append(
+            f"tolerance {details['tolerance']:g} {met}: error {details['held_out_error']:.4f} at points held out, below "
+            f"{details['held_out_bound']:.4f} with {details['confidence']:.0%} confidence, under {under}"
+        )
     if "edge_ray_probes" in details:
         lines.append(f"{details['edge_ray_probes']} of them by edge rays")
     how = "fitted to the points" if known["content"] == "fitted" else "the field's values"
