@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from difflpv.propagation import propagate
+from difflpv.propagation import propagate, propagate_moving
 from difflpv.sh import cosine_lobe
 from difflpv.stability import stability
 from difflpv.stencil import LinearStencil, holpv_stencil
@@ -74,6 +74,33 @@ def test_gradient_by_finite_differences(rung):
         up, down = (loss(torch.tensordot(theta + e * direction, basis, 1)) for e in (1e-5, -1e-5))
     assert abs(theta.grad @ direction) > 1e-3
     assert (theta.grad @ direction).item() == pytest.approx(((up - down) / 2e-5).item(), rel=1e-6)
+
+
+def test_matrices_of_the_first_steps():
+    basis = torch.tensor(np.array(equivariant_basis(2, 26)))
+    theta = torch.tensor(np.random.default_rng(0).normal(size=(3, len(basis))) / 20, requires_grad=True)
+    offsets = np.array(neighborhood_offsets(26))
+    volume = torch.zeros((4, 9, 9, 9, 9), dtype=torch.float64)
+    for j, i in enumerate(IMPULSES[2].index):
+        volume[j, i, 4, 4, 4] = 1
+    moving, total = volume, volume
+    for step in range(4):
+        own = torch.tensordot(theta[min(step, 2)].detach(), basis, 1).numpy()
+        moving = propagate_moving(moving, LinearStencil("any", offsets, own), steps=1)[1]
+        total = total + moving
+    loss = FreeSpaceLoss(2, 26, (Shell(2, 1, 3), Shell(4, 2, 4, 0.5)), size=5, dtype=torch.float64)
+
+    def matrices(numbers):
+        return torch.tensordot(numbers, basis, 1)
+
+    found = loss.responses(matrices(theta))
+    torch.testing.assert_close(found[-1].detach(), total[:, :, 4:, 4:, 4:].movedim(1, -1), rtol=1e-12, atol=1e-14)
+    loss(matrices(theta)).backward()
+    direction = torch.tensor(np.random.default_rng(1).normal(size=theta.shape))
+    with torch.no_grad():
+        up, down = (loss(matrices(theta + e * direction)) for e in (1e-5, -1e-5))
+    assert (theta.grad.abs().sum(1) > 1e-3).all()
+    assert (theta.grad * direction).sum().item() == pytest.approx(((up - down) / 2e-5).item(), rel=1e-6)
 
 
 def lpv(**kwargs):

@@ -109,19 +109,19 @@ class _Responses(torch.autograd.Function):
         ctx: Any, matrices: torch.Tensor, neighbors: int, l_max: int, size: int, stops: tuple[int, ...]
     ) -> torch.Tensor:
         offsets = neighborhood_offsets(neighbors)
-        weight = stencil_weight(offsets, matrices)
+        weights = [stencil_weight(offsets, own) for own in matrices]
         parities = octant_parities(l_max).to(matrices.dtype)
         index = IMPULSES[l_max].index
-        field = matrices.new_zeros((len(index), 1, 1, 1, matrices.shape[1]))
+        field = matrices.new_zeros((len(index), 1, 1, 1, matrices.shape[-1]))
         field[range(len(index)), 0, 0, 0, index] = 1.0
-        total = matrices.new_zeros((len(index), size, size, size, matrices.shape[1]))
+        total = matrices.new_zeros((len(index), size, size, size, matrices.shape[-1]))
         total[:, 0, 0, 0] = field[:, 0, 0, 0]
         kept, results = [], []
         for step in range(1, max(stops) + 1):
             w = min(step + 1, size)
             padded = _pad(field, w, parities)
             kept.append(padded)
-            field = _convolve(padded, weight)
+            field = _convolve(padded, weights[min(step, len(weights)) - 1])
             total[:, :w, :w, :w] += field
             if step in stops:
                 results.append(total.clone())
@@ -133,11 +133,11 @@ class _Responses(torch.autograd.Function):
     def backward(ctx: Any, bar: torch.Tensor) -> tuple[Any, ...]:
         (matrices,) = ctx.saved_tensors
         offsets, l_max, size, stops = ctx.setup
-        transposed = stencil_weight(-offsets, matrices.transpose(1, 2))
+        transposed = [stencil_weight(-offsets, own.transpose(1, 2)) for own in matrices]
         parities = octant_parities(l_max).to(matrices.dtype)
         share = torch.as_tensor(octant_multiplicity(size), dtype=matrices.dtype)[..., None]
         bar = bar / share  # per cell of the full cube, where the adjoint field has the symmetries of the field
-        sums = matrices.new_zeros((3, 3, 3, *matrices.shape[1:]))
+        sums = matrices.new_zeros((len(matrices), 3, 3, 3, *matrices.shape[2:]))
         source = torch.zeros_like(bar[0])
         after = torch.zeros_like(bar[0])
         for step in reversed(range(1, max(stops) + 1)):
@@ -145,19 +145,21 @@ class _Responses(torch.autograd.Function):
             if step in stops:
                 source = source + bar[sorted(stops).index(step)]
             after = source[:, :w, :w, :w] + after[:, :w, :w, :w]
-            sums += _correlate(after * share[:w, :w, :w], ctx.kept[step - 1])
+            own = min(step, len(matrices)) - 1
+            sums[own] += _correlate(after * share[:w, :w, :w], ctx.kept[step - 1])
             if step > 1:
                 below = min(step, size)
-                after = _convolve(_pad(after, w, parities), transposed)[:, :below, :below, :below]
+                after = _convolve(_pad(after, w, parities), transposed[own])[:, :below, :below, :below]
         z, y, x = (offsets[:, axis] + 1 for axis in (2, 1, 0))
-        return sums[z, y, x], None, None, None, None
+        return sums[:, z, y, x], None, None, None, None
 
 
 def octant_responses(matrices: torch.Tensor, *, neighbors: int, l_max: int, size: int, stops: tuple[int, ...]) -> torch.Tensor:
     """Light accumulated over the steps after an impulse in the cell at the origin.
 
     Args:
-        matrices: a stencil that respects the cube's symmetries, offsets as in ``neighborhood_offsets``, shape [n,K,K].
+        matrices: a stencil that respects the cube's symmetries, offsets as in ``neighborhood_offsets``, shape [n,K,K]; or one
+            for each of the first steps [s,n,K,K], of which the last goes on.
             Its gradient is right up to what the symmetries average out: contract it with ``equivariant_basis``.
         neighbors: 6 or 26.
         l_max: 1, 2 or 3.
@@ -169,6 +171,7 @@ def octant_responses(matrices: torch.Tensor, *, neighbors: int, l_max: int, size
     """
     if list(stops) != sorted(set(stops)) or stops[0] < 1:
         raise ValueError(f"stops: expected increasing numbers of steps from 1, got {stops}")
-    if matrices.shape != (len(neighborhood_offsets(neighbors)), coeff_count(l_max), coeff_count(l_max)):
+    expected = (len(neighborhood_offsets(neighbors)), coeff_count(l_max), coeff_count(l_max))
+    if matrices.shape[-3:] != expected or matrices.ndim not in (3, 4) or not len(matrices):
         raise ValueError(f"matrices: expected {neighbors} neighbours and the cell at l_max {l_max}, got {list(matrices.shape)}")
-    return _Responses.apply(matrices, neighbors, l_max, size, tuple(stops))
+    return _Responses.apply(matrices.reshape(-1, *expected), neighbors, l_max, size, tuple(stops))

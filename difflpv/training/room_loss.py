@@ -7,7 +7,7 @@ errors over rooms and components, in which every room counts alike, however hard
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -42,8 +42,10 @@ class RoomResponse:
 
     @classmethod
     @torch.no_grad()
-    def of(cls, room: TrainingRoom, stencil: LinearStencil, method: Method) -> RoomResponse:
-        """Solve a room with a stencil in the place of the method's own."""
+    def of(
+        cls, room: TrainingRoom, stencil: LinearStencil, method: Method, transport: Callable[..., torch.Tensor] = propagate
+    ) -> RoomResponse:
+        """Solve a room with a stencil, and with a way of moving light, in the place of the method's own."""
         config = LpvConfig(method=method)
         weight = torch.as_tensor(room.receivers.area_weight, dtype=torch.float32)
         lights, truths = [], []
@@ -58,7 +60,7 @@ class RoomResponse:
             truths.append(truth / norm)
         receivers = traced.receivers(room.receivers.position, room.receivers.normal)
         (reads,) = receivers.reads
-        solved = propagate(
+        solved = transport(
             torch.cat(lights), stencil, steps=_STEPS, transmittance=traced.blocking[0].passed, occlude_first_step=True
         )
         lobes = cosine_lobe(-receivers.normal, stencil.l_max) / room.grid.cell_size**2
