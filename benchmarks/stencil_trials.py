@@ -36,7 +36,7 @@ VERDICT = (
     "- *Planes 8 x*: lit planes weigh 8 times, the nearest cells 3 times, the two shells above twice as much as in training.",
     "- Free space can be had, with one stencil for both shells, and rooms pay for it: longer training lowers both shells and",
     "  raises the error of rooms and scenes. Weighing planes more and stopping early gives rooms and cornell back and makes",
-    "  two_rooms_90 a fifth better, but then only the far shell gains.",
+    "  two_rooms_90 a sixth better, but then only the far shell gains.",
     "- Not kept: no trial lowers both shells by a tenth without a loss elsewhere, and by the further rooms, which are what a",
     "  choice may look at, none is better than what is shipped.",
 )
