@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, get_args
 
@@ -50,6 +51,9 @@ class LpvConfig:
         coarsen_after: after so many steps light goes on in cells of twice the edge, where a step is an eighth of the work and
             goes twice as far; receivers read both grids, and ``tolerance`` counts on each by itself. None, or no step left:
             one grid.
+        probes: positions (x, y, z) [m] in free space of light probes that the volume lights; receivers read them instead of
+            its cells (``difflpv.lit_probes``). Needs the "affine" lookup, by which probes read cells, and 9 coefficients or
+            more. None by default.
     """
 
     method: Method = "holpv"
@@ -64,6 +68,7 @@ class LpvConfig:
     tolerance: float = 0.0
     lookup: Lookup | None = None
     coarsen_after: int | None = None
+    probes: tuple[tuple[float, float, float], ...] = ()
 
     def __post_init__(self) -> None:
         learned = self.method in LEARNED_STENCILS
@@ -92,10 +97,24 @@ class LpvConfig:
             raise ValueError(f"tolerance: expected a number >= 0, got {self.tolerance}")
         if self.coarsen_after is not None and self.coarsen_after < 1:
             raise ValueError(f"coarsen_after: expected at least 1 step, got {self.coarsen_after}")
+        self._check_probes()
         if learned:
             object.__setattr__(self, "clamp", False)
             self._check_learned()
         _ = self.stencil
+
+    def _check_probes(self) -> None:
+        try:
+            given = [[float(v) for v in position] for position in self.probes]
+        except (TypeError, ValueError):
+            raise ValueError("probes: expected positions (x, y, z) of numbers [m]") from None
+        if not all(len(p) == 3 and all(map(math.isfinite, p)) for p in given):
+            raise ValueError("probes: expected positions (x, y, z) of finite numbers [m]")
+        object.__setattr__(self, "probes", tuple((x, y, z) for x, y, z in given))
+        if given and self.lookup != "affine":
+            raise ValueError(f"probes: they read cells by the 'affine' lookup, got lookup '{self.lookup}'")
+        if given and self.stencil.l_max < 2:
+            raise ValueError(f"probes: expected 9 coefficients or more, '{self.method}' has {(self.stencil.l_max + 1) ** 2}")
 
     def _check_learned(self) -> None:
         own = learned_stencil(self.method).l_max

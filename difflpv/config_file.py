@@ -2,8 +2,9 @@
 
     {"method": "learned_9x6", "cells": 24, "config": {"method": "learned_9x6", "steps": 24, ...}, ...}
 
-``difflpv plan`` writes such files; whatever else stands beside these three is for people. The object of
-``LpvConfig.to_json`` alone will do too: the scene's own cells are meant then.
+``difflpv plan`` writes such files; what else stands beside these three is for people, but for the scene that light probes of
+the configuration were placed in ("scene", "scene_hash"). The object of ``LpvConfig.to_json`` alone will do too: the scene's
+own cells are meant then.
 """
 
 from __future__ import annotations
@@ -29,11 +30,13 @@ class ConfigFile:
         method: of ``config``, or "constant".
         config: of the volume; None for "constant".
         cells: along x of the scene's grid; None for the scene's own.
+        scene: name and hash of the scene that the configuration's light probes were placed in; None where it is not told.
     """
 
     method: str
     config: LpvConfig | None
     cells: int | None
+    scene: tuple[str, str] | None = None
 
 
 def read_config_file(path: str | Path) -> ConfigFile:
@@ -61,4 +64,6 @@ def read_config_file(path: str | Path) -> ConfigFile:
         config = LpvConfig.from_json(values)
     except (TypeError, ValueError) as error:
         raise ConfigFileError(f"{path}: config: {' '.join(str(error).split())}") from None
-    return ConfigFile(config.method, config, cells)
+    placed = (content.get("scene"), content.get("scene_hash"))
+    scene = (placed[0], placed[1]) if isinstance(placed[0], str) and isinstance(placed[1], str) else None
+    return ConfigFile(config.method, config, cells, scene)

@@ -25,8 +25,10 @@ from difflpv.direct import (
     visibility,
 )
 from difflpv.grid import Grid
+from difflpv.lit_probes import VolumeProbes
 from difflpv.lookup import CellReads, Lookup, OpenCells, open_cells
 from difflpv.occlusion import Blockers
+from difflpv.probes.rows import Rows
 from difflpv.raycast import Raycaster
 from difflpv.rsm import Rsm, TexelFlux, render_rsm, rsm_blockers, rsm_vpls
 from difflpv.scene import AreaLight, Scene, SceneError
@@ -81,6 +83,7 @@ class Receivers:
         reads: cells that each may read, for each of the configuration's grids; empty where the lookup reads all eight.
         lookup: what they were picked by.
         boxes: for each of the grids a box of cells that holds all that is read, (z, y, x) as (begin, end) pairs.
+        rows: which of the configuration's light probes each reads; ``reads`` and ``boxes`` are those of the probes then.
     """
 
     position: torch.Tensor
@@ -89,6 +92,7 @@ class Receivers:
     reads: tuple[CellReads, ...] = ()
     lookup: Lookup = "trilinear"
     boxes: tuple[tuple[int, ...], ...] = ()
+    rows: Rows | None = None
 
     def __len__(self) -> int:
         return len(self.position)
@@ -217,9 +221,13 @@ class Illumination:
         x, n = (torch.as_tensor(a, dtype=like.dtype, device=like.device).detach() for a in (position, normal))
         check_points("position", x)
         check_points("normal", n, count=len(x))
-        seen, reads, grids = None, [], self.config.grids(self.grid)
+        seen, rows, grids = None, None, self.config.grids(self.grid)
+        reads: list[CellReads] = []
         boxes = [_box_around(x, grid) for grid in grids]
-        if self.config.lookup in ("front", "visible", "affine"):
+        if self.config.probes:
+            reads, rows = list(self.probes.reads), self.probes.rows(x)
+            boxes = [r.box(grid) for r, grid in zip(reads, grids, strict=True)]
+        elif self.config.lookup in ("front", "visible", "affine"):
             for grid in grids:
                 usable = self._open_cells(x, n, self.config.lookup, grid, _BIAS)
                 reads.append(CellReads(usable.cells, usable.weights(x, n, grid), usable.backed))
@@ -227,7 +235,13 @@ class Illumination:
         punctual = self._punctual()
         if self.component == "direct" and bool(punctual.any()):
             seen = visibility(x, n, self.emitters.select(punctual), self.raycaster)
-        return Receivers(x, n, seen, tuple(reads), self.config.lookup or "trilinear", tuple(boxes))
+        return Receivers(x, n, seen, tuple(reads), self.config.lookup or "trilinear", tuple(boxes), rows)
+
+    @cached_property
+    def probes(self) -> VolumeProbes:
+        """The configuration's light probes in this volume."""
+        like, position = self.emitters.position, np.array(self.config.probes)
+        return VolumeProbes.of(position, self.config.grids(self.grid), self.raycaster, dtype=like.dtype, device=like.device)
 
     def punctual_irradiance(self, receivers: Receivers, values: LightValues | None = None) -> torch.Tensor | None:
         """Direct irradiance [n,3] W/m2 of point, spot and directional lights by shadow rays; None where there is none."""

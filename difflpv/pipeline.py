@@ -18,7 +18,9 @@ from difflpv.grid import Grid
 from difflpv.illumination import Illumination, LightValues, Receivers
 from difflpv.injection import InjectionReport, inject
 from difflpv.learnables import describe_learnables, fixed_values
+from difflpv.lit_probes import probe_radiance
 from difflpv.parameters import Parameter
+from difflpv.probes.lookup import probe_irradiance
 from difflpv.propagation import propagate, propagate_moving
 from difflpv.sampling import sample_irradiance
 from difflpv.scene import Scene
@@ -290,11 +292,16 @@ class Lpv(torch.nn.Module):
                 for volume, grid in zip(volumes, grids, strict=True)
             ]
             return torch.stack(parts).sum(0)
+        if (receivers.rows is None) == bool(self.config.probes):
+            raise ValueError("receivers: made for a configuration with light probes, this one has none, or the other way round")
         if receivers.lookup != self.config.lookup or len(receivers.reads) < len(grids):
             raise ValueError(
                 f"receivers: made for lookup '{receivers.lookup}' on {len(receivers.reads)} grid(s), this solve needs "
                 f"'{self.config.lookup}' on {len(grids)}"
             )
+        if receivers.rows is not None:
+            held = probe_radiance(volumes, grids, receivers.reads[: len(grids)], gains)
+            return probe_irradiance(receivers.rows, held, n)
         lobe, parts = cosine_lobe(-n, self.config.stencil.l_max), []
         for volume, grid, r in zip(volumes, grids, receivers.reads[: len(grids)], strict=True):
             lobes = lobe * (1 + (gains - 1) * r.backed[:, None])

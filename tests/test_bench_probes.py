@@ -76,7 +76,7 @@ def test_the_box_is_the_scenes_own_and_no_free_space_is_one_clear_error(cornell)
     room = box_scene()
     solid = tuple(replace(wall, name=f"solid {wall.name}") for wall in box_walls([-0.15] * 3, [0.15] * 3))
     np.testing.assert_allclose(prepare(one, replace(cornell, scene=room)).position, [[0, 0, 0]], atol=1e-12)
-    with pytest.raises(ValueError, match=f"'{TRACED}': no probe of 'cornell' lies in free space"):
+    with pytest.raises(ValueError, match="probes: none of at most 1 on a uniform grid of 'full' lies in free space"):
         prepare(one, replace(cornell, scene=Scene("full", room.meshes + solid, room.lights)))
     floor = replace(cornell, scene=Scene("floor", room.meshes[2:3], room.lights))  # at y = -1, with its grid's depth
     assert np.ptp(prepare(replace(one, probes=8), floor).position[:, 1]) > 0

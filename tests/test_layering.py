@@ -53,6 +53,7 @@ LAYERS: tuple[tuple[str, tuple[str, ...]], ...] = (
             "difflpv.injection",
             "difflpv.io.exports",  # formats of engines: they know light probes, which difflpv.io below does not
             "difflpv.linear_propagation",
+            "difflpv.lit_probes",
             "difflpv.lookup",
             "difflpv.loss",
             "difflpv.occlusion",

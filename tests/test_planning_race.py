@@ -1,6 +1,7 @@
 """What the race may skip: laws on ladders of known errors, and how often chance gets a bad rung chosen."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -44,26 +45,82 @@ def test_finer_cells_are_not_tried_where_even_the_square_of_their_edge_would_not
     assert "is not met by anything on the ladder; best found 32: error 0.400" in explain(plan)
 
 
-@settings(max_examples=150, deadline=None)
-@given(st.lists(st.tuples(st.floats(0.05, 2.0), st.lists(st.floats(-1, 2), min_size=4, max_size=4)), min_size=1, max_size=3),
-       st.floats(0.01, 1.0))  # fmt: skip
-def test_no_answer_is_skipped_while_errors_fall_no_faster_than_the_square(known, tolerance):
-    """Families fall by any power up to 2 from size to size, or rise."""
+def families_of(known):
+    """Rungs, errors and seconds of families: the error in 8 cells, and the powers by which it falls from size to size."""
     rungs, errors, seconds = [], {}, {}
-    for number, (first, powers) in enumerate(known):
-        error = first
+    for number, (error, powers) in enumerate(known):
         for k, n in enumerate(CELLS):
             rung = Configuration(f"{number}: {n}", "volume", "learned", LpvConfig(method=METHODS[number]), cells=n)
             if k:
                 error *= (CELLS[k - 1] / n) ** powers[k - 1]
             rungs.append(rung)
             errors[rung.name], seconds[rung.name] = error, n**3 * 1.37**number
+    return rungs, errors, seconds
+
+
+powers = st.lists(st.floats(-1, 2), min_size=4, max_size=4)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.floats(0.05, 2.0), powers, st.floats(0.01, 1.0))
+def test_no_answer_is_skipped_while_errors_fall_no_faster_than_the_square(first, powers, tolerance):
+    """One family falls by any power up to 2 from size to size, or rises."""
+    answer_is_found(*families_of([(first, powers)]), tolerance)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.lists(st.tuples(st.floats(0.05, 2.0), st.lists(st.floats(0.91, 1.09), min_size=5, max_size=5)), min_size=1,
+       max_size=3), st.lists(st.floats(-1, 1.4), min_size=4, max_size=4), st.floats(0.01, 1.0))  # fmt: skip
+def test_no_answer_is_skipped_while_families_fall_alike(known, powers, tolerance):
+    """The same powers for all, but for scatter within the margin of 1.25 between two sizes of two families."""
+    rungs, errors, seconds = families_of([(first, powers) for first, _ in known])
+    for number, (_, scatter) in enumerate(known):
+        for n, factor in zip(CELLS, scatter, strict=True):
+            errors[f"{number}: {n}"] *= factor**0.5
+    answer_is_found(rungs, errors, seconds, tolerance)
+
+
+def answer_is_found(rungs, errors, seconds, tolerance):
     plan = plan_with(KnownJudge(errors, seconds), rungs, tolerance=tolerance)
     meeting = [seconds[name] for name in errors if errors[name] <= tolerance]
     assert (plan.chosen is None) == (not meeting)
     if meeting:
         assert errors[plan.chosen.rung.name] <= tolerance
         assert seconds[plan.chosen.rung.name] <= 1.1 * min(meeting) * (1 + 1e-9)
+
+
+def test_what_finer_cells_did_to_one_stencil_foretells_the_next():
+    """32 cells bought the first a tenth of its error: not a half of the second's, whatever the square of the edge says."""
+    methods = {"one": "learned_9x6", "other": "learned_9x26"}
+    rungs = [Configuration(f"{name} {n}", "volume", "learned", LpvConfig(method=method), cells=n)
+             for name, method in methods.items() for n in (16, 32)]  # fmt: skip
+    errors = {"one 16": 0.6, "one 32": 0.54, "other 16": 0.5, "other 32": 0.15}
+    judge = KnownJudge(errors, {"one 16": 1, "one 32": 8, "other 16": 2, "other 32": 16})
+    plan = plan_with(judge, rungs, tolerance=0.2)
+    assert plan.chosen is None
+    assert {r.rung.name for r in plan.runners if r.state == "hopeless"} == {"other 32"}  # 0.5 x 0.9 / 1.25 = 0.36
+    assert plan_with(judge, rungs, tolerance=0.3).chosen.rung.name == "other 32"
+    eight = {"one 8": 0.5, "one 32": 0.45, "other 8": 0.4, "other 32": 0.1}  # 8 cells say too little
+    rungs = [replace(r, name=r.name.replace("16", "8"), cells=8 if r.cells == 16 else 32) for r in rungs]
+    judge = KnownJudge(eight, {"one 8": 1, "one 32": 8, "other 8": 2, "other 32": 16})
+    assert plan_with(judge, rungs, tolerance=0.2).chosen.rung.name == "other 32"
+
+
+def probes_in(volume, count, name):
+    return replace(volume, name=name, kind="lit probes", family="LPV-lit probes", probes=count)
+
+
+def test_probes_are_not_tried_where_their_volume_says_no_and_chosen_where_lookups_count():
+    (volume,) = sizes_of((16,))
+    rungs, errors = [volume, probes_in(volume, 64, "probes")], {"16": 0.3, "probes": 0.25}
+    judge = KnownJudge(errors, {"16": 1.0, "probes": 1.1})
+    plan = plan_with(judge, rungs, tolerance=0.2)  # 0.3 / 1.25
+    assert [r.state for r in plan.runners] == ["out", "hopeless"]
+    assert plan_with(judge, rungs, tolerance=0.27).chosen.rung.name == "probes"
+    assert plan_with(judge, rungs, tolerance=0.4).chosen.rung.name == "16"
+    judge = KnownJudge(errors, {"16": 9.0, "probes": 1.1})
+    judge.moving, judge.work = 1000, lambda rung: 1e9  # the same solve; their lookups are cheaper
+    assert plan_with(judge, rungs, tolerance=0.4).chosen.rung.name == "probes"
 
 
 class EasierFirst(KnownJudge):

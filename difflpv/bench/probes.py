@@ -18,19 +18,17 @@ from difflpv.bench.scenes import BenchScene
 from difflpv.bench.timing import timed
 from difflpv.bench.tracers import PEER_SEED
 from difflpv.bench.volume import VolumeRun
+from difflpv.grid import Grid
 from difflpv.learnables import fixed_values
-from difflpv.lookup import open_cells
+from difflpv.lit_probes import VolumeProbes, probe_radiance
 from difflpv.placement.uniform import uniform_grids
 from difflpv.probes.lookup import probe_irradiance
-from difflpv.probes.probe_set import COEFFS
 from difflpv.probes.rows import Rows
 from difflpv.probes.tetrahedra import TetrahedralInterpolation
 from difflpv.scene import Scene
 from difflpv.triangle_distance import triangle_distance
 
-__all__ = ["LitProbes", "ProbeRun", "TracedProbes"]
-
-_ODD = slice(1, 4)  # coefficients of degree 1: the only odd one of 9
+__all__ = ["LitProbes", "ProbeRun", "TracedProbes", "probe_grid"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +44,29 @@ class _Space:
         free = off > max(margin, default_clearance(self.bounds))
         free[free] = is_free(self.scene, position[free], self.seed)
         return free
+
+
+def probe_grid(scene: Scene, grid: Grid, count: int, *, seed: int = 0, refinements: int | None = None) -> np.ndarray:
+    """Positions [n,3] m of the finest uniform grid of at most ``count`` probes in free space, where scene and grid overlap.
+
+    Args:
+        scene: the scene.
+        grid: of the volume.
+        count: probes at most.
+        seed: of the rays that tell free space.
+        refinements: finer grids to try where probes fall into solids, see ``difflpv.placement.uniform.uniform_grids``.
+
+    Raises:
+        ValueError: no probe lies in free space.
+    """
+    inside, outside = scene.bounds, (np.asarray(grid.minimum), np.asarray(grid.maximum))
+    low, high = np.maximum(inside[0], outside[0]), np.minimum(inside[1], outside[1])
+    flat = high - low < grid.cell_size  # a lone floor has its grid's depth
+    box = np.where(flat, outside[0], low), np.where(flat, outside[1], high)
+    grids = uniform_grids(_Space(scene, box, seed), count, refinements=refinements)
+    if not grids:
+        raise ValueError(f"probes: none of at most {count} on a uniform grid of '{scene.name}' lies in free space")
+    return grids[0].position
 
 
 class ProbeRun:
@@ -70,22 +91,11 @@ class ProbeRun:
         """
         assert configuration.probes is not None
         self.configuration, self.bench = configuration, bench
-        self.lights = 0.0
-        self.position, placing = timed(lambda: self._placed(configuration.probes or 0))
+        self.lights, count = 0.0, configuration.probes
+        self.position, placing = timed(lambda: probe_grid(bench.scene, bench.grid(), count, seed=bench.seed))
         self._interpolation, connecting = timed(lambda: TetrahedralInterpolation(self.position))
         (self._rows, self._normals), finding = timed(lambda: self._reads(bench.position, bench.normal))
         self.setup = {"probes": placing + connecting, "receivers": finding}
-
-    def _placed(self, count: int) -> np.ndarray:
-        grid = self.bench.grid()
-        inside, outside = self.bench.scene.bounds, (np.asarray(grid.minimum), np.asarray(grid.maximum))
-        low, high = np.maximum(inside[0], outside[0]), np.minimum(inside[1], outside[1])
-        flat = high - low < grid.cell_size  # a lone floor has its grid's depth
-        box = np.where(flat, outside[0], low), np.where(flat, outside[1], high)
-        grids = uniform_grids(_Space(self.bench.scene, box, self.bench.seed), count)
-        if not grids:
-            raise ValueError(f"configuration '{self.configuration.name}': no probe of '{self.bench.name}' lies in free space")
-        return grids[0].position
 
     def _reads(self, position: np.ndarray, normal: np.ndarray) -> tuple[Rows, torch.Tensor]:
         points = torch.as_tensor(position, dtype=torch.float64)
@@ -135,23 +145,16 @@ class LitProbes(ProbeRun):
         """As ``ProbeRun``, and all that ``VolumeRun`` traces and tunes."""
         super().__init__(configuration, bench)
         self.volume = VolumeRun(configuration, bench, tuning=tuning)
-        self._cells, seeing = timed(self._seen)
+        grids, raycaster = self.volume.config.grids(self.volume.grid), self.volume.light.raycaster
+        self._probes, seeing = timed(
+            lambda: VolumeProbes.of(self.position, grids, raycaster, dtype=torch.float32, device=torch.device("cpu"))
+        )
         placing, finding = self.setup["probes"], self.setup["receivers"]
         self.setup = {**self.volume.setup, "probes": placing + seeing, "receivers": finding}
         values = {**fixed_values(self.volume.config), **self.volume.lpv.values()}
         degrees = torch.arange(self.volume.config.stencil.l_max + 1)
-        self._gains = values["lookup_gains"].detach().float().repeat_interleave(2 * degrees + 1)[:COEFFS]
+        self._gains = values["lookup_gains"].detach().float().repeat_interleave(2 * degrees + 1)
         self.lights = self.volume.lights
-
-    def _seen(self) -> list[tuple[torch.Tensor, torch.Tensor]]:
-        found = []
-        # in free space any normal will do: without a bias it only lifts the rays by the tracer's own offset
-        normal = np.tile((0.0, 1.0, 0.0), (len(self.position), 1))
-        x, n = (torch.as_tensor(a, dtype=torch.float32) for a in (self.position, normal))
-        for grid in self.volume.config.grids(self.volume.grid):
-            usable = open_cells(self.position, normal, grid, mode="affine", raycaster=self.volume.light.raycaster, bias=0.0)
-            found.append((usable.cells.long(), usable.weights(x, n, grid, bias=0.0)))
-        return found
 
     def solve(self) -> torch.Tensor:
         """Solve the volume and sample it at the probes."""
@@ -159,15 +162,5 @@ class LitProbes(ProbeRun):
 
     @torch.no_grad()
     def content(self, volumes: tuple[torch.Tensor, ...]) -> torch.Tensor:
-        """Radiance SH of the probes [n,9,3] W/m2 from volumes [3,K,n_z,n_y,n_x] W/sr of each grid.
-
-        Intensity along the flight over h^2 is radiance there; looking toward the light flips the odd degrees. The stencil's
-        gains for reading with a wall behind (``difflpv.lookup``, "backed") go into the content: receivers lie on surfaces.
-        """
-        total = torch.zeros(len(self.position), COEFFS, 3)
-        grids = self.volume.config.grids(self.volume.grid)
-        for volume, grid, (cells, weights) in zip(volumes, grids, self._cells, strict=True):
-            held = volume[:, :COEFFS].flatten(2)[:, :, cells]  # [3,9,n,27]
-            total += torch.einsum("cknj,nj->nkc", held, weights) / grid.cell_size**2
-        total[:, _ODD] *= -1
-        return total * self._gains[:, None]
+        """Radiance SH of the probes [n,9,3] W/m2 from volumes [3,K,n_z,n_y,n_x] W/sr of each grid."""
+        return probe_radiance(volumes, self.volume.config.grids(self.volume.grid), self._probes.reads, self._gains)

@@ -7,7 +7,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from difflpv.cli.failures import INTERRUPTED
-from difflpv.cli.options import COMPONENTS, UsageError, add_command, add_output, positive, positive_float, seeded, usage_errors
+from difflpv.cli.options import (
+    COMPONENTS,
+    UsageError,
+    add_command,
+    add_output,
+    natural,
+    positive,
+    positive_float,
+    seeded,
+    usage_errors,
+)
 from difflpv.cli.output import make_folder, print_json, warn
 
 if TYPE_CHECKING:
@@ -30,11 +40,16 @@ def add_parser(subparsers: Any) -> None:
         example="""
         difflpv plan cornell --tolerance 0.2 --out out/plan.json
         difflpv plan cornell --budget-ms 20 --out out/plan.json
+        difflpv plan cornell --tolerance 0.25 --moving 100000 --out out/plan.json
         """,
     )
     goal = parser.add_mutually_exclusive_group(required=True)
     goal.add_argument("--tolerance", type=positive_float, metavar="E", help="relative L2 error of irradiance to stay below")
     goal.add_argument("--budget-ms", type=positive_float, metavar="MS", help="time that one solve may take on this machine")
+    parser.add_argument(
+        "--moving", type=natural, default=0, metavar="N", help="receivers that move, as on objects: a rung's time counts what "
+        "they take to find out anew what they see and to read it, where light probes are cheap (default: 0, receivers stay)"
+    )
     parser.add_argument("--component", choices=COMPONENTS, default="bounce1", help="of the light (default: %(default)s)")
     parser.add_argument(
         "--confidence", type=float, default=0.95, metavar="P", help="that the error is below the tolerance (default: 0.95)"
@@ -75,6 +90,7 @@ def run(args: argparse.Namespace) -> int:
             confidence=args.confidence,
             seed=args.seed,
             workers=args.workers,
+            moving=args.moving,
             tell=(lambda runner: None) if args.json else _tell,
         )
     if plan.best is not None:

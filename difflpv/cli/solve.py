@@ -169,6 +169,9 @@ def _configured(args: argparse.Namespace, scene: Scene, given: dict[str, Any]) -
             raise UsageError(f"{_option(name, value)}{shown}: {args.config} has {name} {fixed.get(name)}")
     if file.config is None and not hasattr(args, "fitted"):
         raise UsageError(f"--config: {args.config} is a constant, which has nothing to fit")
+    if file.config is not None and file.config.probes and file.scene is not None and file.scene[1] != scene.hash:
+        placed, here = f"scene '{file.scene[0]}'", f"this '{scene.name}'"
+        raise UsageError(f"--config: {args.config} has light probes placed in {placed}, not in {here}")
     with usage_errors():
         return Solve(file.method, file.config or LpvConfig(), grid_for(scene, args.grid or file.cells))
 
@@ -219,6 +222,8 @@ def describe_solve(solve: Solve) -> str:
     ]
     if config.fine_steps < config.steps:
         parts.insert(3, f"the last {config.steps - config.fine_steps} in cells of twice the edge")
+    if config.probes:
+        parts.append(f"read through {len(config.probes)} light probes")
     return ", ".join(parts + ([] if config.clamp else ["no clamp"]))
 
 

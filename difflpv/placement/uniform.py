@@ -52,7 +52,7 @@ class UniformGrid:
 
 
 def uniform_grids(
-    task: FreeSpace, count: int, spread: float = 1.0, *, margin: float | None = None
+    task: FreeSpace, count: int, spread: float = 1.0, *, margin: float | None = None, refinements: int | None = None
 ) -> list[UniformGrid]:
     """The finest grids of near-cubic spacing of which at most ``count`` probes lie in free space, best proportions first.
 
@@ -63,6 +63,8 @@ def uniform_grids(
         count: probes at most.
         spread: scale about the centre of the box.
         margin: if given, probes in solids are first moved out of them, this share of the smallest spacing off the surface.
+        refinements: finer grids that are tried; enough to miss hardly any by default, which takes seconds where a scene has
+            many triangles. 0: one grid of ``count``, with its free probes.
 
     Returns:
         Up to three such grids, and up to three of ``count`` probes, with their free probes alone; none if no grid has any.
@@ -76,6 +78,7 @@ def uniform_grids(
     plain = best = fitting(count)
     kept = max((len(grid.position) for grid in best), default=0)
     tried, enough = (_REFINEMENTS, count) if margin is None else (_MOVED_REFINEMENTS, 0.95 * count)
+    tried = tried if refinements is None else refinements
     for total in sorted({round(count * _FINEST ** (k / tried)) for k in range(1, tried + 1)} - {count}):
         if kept >= enough:
             break

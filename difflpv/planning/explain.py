@@ -13,7 +13,7 @@ _STATES = {
     "out": "error surely too large",
     "unsure": "not surely within the tolerance",
     "dear": "over the budget",
-    "hopeless": "coarser cells of its kind foretell that it cannot",
+    "hopeless": "what was judged of its kind foretells that it cannot",
     "met": "within the tolerance, but dearer than what was chosen",
     "open": "dearer than what was chosen",
 }
@@ -36,6 +36,8 @@ def _verdict(plan: Plan) -> str:
     e = best.estimate
     bound = f"below {e.high:.3f} with {100 * plan.confidence:.4g} %"
     found = f"{best.rung.name}: error {e.error:.3f} ({bound}), {1e3 * best.seconds:.2f} ms a solve"
+    if plan.moving:
+        found += f" with the lookups of {plan.moving} receivers that move"
     if plan.chosen is not None:
         return f"{goal} is met by {found}"
     if best.level < plan.last_level:

@@ -1,7 +1,8 @@
 """The ladder of models that a plan climbs, and how much work each is.
 
-A rung is a ``difflpv.bench.configuration.Configuration``. Further kinds (probes) join as configurations of their own kind
-beside a judge that can measure them (``difflpv.planning.race.Judge``).
+A rung is a ``difflpv.bench.configuration.Configuration``: a constant, a volume, or light probes that a volume lights and that
+receivers read instead of its cells. Further kinds join as configurations of their own kind beside a judge that can measure them
+(``difflpv.planning.race.Judge``).
 """
 
 from __future__ import annotations
@@ -33,6 +34,12 @@ def _rung(method: Method, cells: int, **options: Any) -> Configuration:
     return Configuration(", ".join(parts), "volume", family, config, cells)
 
 
+def _probes(count: int, method: Method, cells: int) -> Configuration:
+    volume = _rung(method, cells)
+    family: Family = "LPV-lit probes"
+    return Configuration(f"{count} probes in {volume.name}", "lit probes", family, volume.config, cells, probes=count)
+
+
 def _ladder() -> tuple[Configuration, ...]:
     rungs = [Configuration("constant", "constant", "constant")]
     for method in _METHODS:
@@ -45,6 +52,7 @@ def _ladder() -> tuple[Configuration, ...]:
     rungs += [_rung(m, cells, occlusion="none") for m in ("learned_4x6", best) for cells in (16, 32)]
     rungs += [_rung(best, cells, occlusion="exp") for cells in (16, 32)]
     rungs += [_rung(best, 16, lookup="visible"), _rung(best, 32, lookup="visible"), _rung(best, 32, lookup="trilinear")]
+    rungs += [_probes(64, best, 16), _probes(512, best, 16), _probes(512, best, 32)]
     return tuple(rungs)
 
 
@@ -60,7 +68,7 @@ def family_of(rung: Configuration) -> tuple[Any, ...]:
     if c is None:
         return (rung.kind,)
     short = c.steps < min(rung.cells or 32, 32)
-    return (rung.kind, c.method, c.occlusion, c.lookup, short, c.coarsen_after is not None)
+    return (rung.kind, rung.probes, c.method, c.occlusion, c.lookup, short, c.coarsen_after is not None)
 
 
 def work_of(rung: Configuration, grid: Grid) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +38,8 @@ class Plan:
         interrupted: True where the race was broken off.
         seconds: spent on planning, by "truth" and "rungs".
         about: scene, component, lights and levels, for the file.
+        moving: receivers whose lookups are part of a rung's time.
+        probes: where the probes of the best rung stand (x, y, z) [m], if it has any.
     """
 
     chosen: Runner | None
@@ -49,6 +51,8 @@ class Plan:
     interrupted: bool = False
     seconds: dict[str, float] = field(default_factory=dict)
     about: dict[str, Any] = field(default_factory=dict)
+    moving: int = 0
+    probes: tuple[tuple[float, float, float], ...] = ()
 
     @property
     def best(self) -> Runner | None:
@@ -61,7 +65,8 @@ class Plan:
     @property
     def config(self) -> LpvConfig | None:
         """Of the best rung; None for the constant, or where nothing was judged."""
-        return None if self.best is None else self.best.rung.config
+        best = None if self.best is None else self.best.rung.config
+        return best if best is None or not self.probes else replace(best, probes=self.probes)
 
     def foreseen(self, runner: Runner) -> float:
         """Error to be expected of a judged rung on the level that the best one reached: as that changed from level to level."""
@@ -84,16 +89,17 @@ class Plan:
 
     def to_json(self) -> dict[str, Any]:
         """Plain values; ``difflpv.config_file`` reads them."""
-        best = self.best
+        best, config = self.best, self.config
         return {
             "format": _FORMAT,
-            "method": None if best is None else best.rung.config.method if best.rung.config else "constant",
+            "method": None if best is None else config.method if config else "constant",
             "cells": None if best is None else best.rung.cells,
-            "config": None if best is None or best.rung.config is None else best.rung.config.to_json(),
+            "config": None if config is None else config.to_json(),
             "met": self.chosen is not None,
             "interrupted": self.interrupted,
             "tolerance": self.tolerance,
             "budget_seconds": self.budget,
+            "moving_receivers": self.moving,
             "confidence": self.confidence,
             "planning_seconds": self.seconds,
             **self.about,
@@ -136,7 +142,7 @@ def plan_with(
             chosen = most_accurate(rungs, judge, budget, runners=runners, tell=tell)
     except KeyboardInterrupt:
         interrupted = True
-    return Plan(chosen, runners, tolerance, budget, confidence, len(judge.slack) - 1, interrupted)
+    return Plan(chosen, runners, tolerance, budget, confidence, len(judge.slack) - 1, interrupted, moving=judge.moving)
 
 
 def make_plan(
@@ -151,6 +157,7 @@ def make_plan(
     confidence: float = 0.95,
     seed: int = 0,
     workers: int = 1,
+    moving: int = 0,
     tell: Callable[[Runner], object] = lambda runner: None,
 ) -> Plan:
     """The cheapest model of a scene within a tolerance, or the most accurate one within a budget.
@@ -166,17 +173,25 @@ def make_plan(
         confidence: of every bound, one-sided.
         seed: of receivers, paths and moved lights.
         workers: processes of the path tracer.
+        moving: receivers that move, as on objects: what it takes to find out anew what they see, and to read it, is part of
+            every rung's time. 0: receivers stay, and only the solve counts.
         tell: told every runner that was judged.
 
     Raises:
-        ValueError: neither or both of tolerance and budget, one that is not positive, or a component that is dark.
+        ValueError: neither or both of tolerance and budget, one that is not positive, a negative number of receivers, or a
+            component that is dark.
     """
+    if moving < 0:
+        raise ValueError(f"moving: expected a number of receivers >= 0, got {moving}")
     begin = time.perf_counter()
     lights = held_out_lights(scene, max(level.lights for level in levels), seed=seed)
     judge = SceneJudge(
-        scene, component, lights, folder, levels=levels, confidence=confidence, seed=seed, workers=workers
+        scene, component, lights, folder, levels=levels, confidence=confidence, seed=seed, workers=workers,
+        moving=moving,
     )  # fmt: skip
     plan = plan_with(judge, rungs, tolerance=tolerance, budget=budget, confidence=confidence, tell=tell)
+    config = None if plan.best is None else judge.config(plan.best.rung)
+    plan.probes = config.probes if config is not None else ()
     plan.seconds = {**judge.spent, "all": time.perf_counter() - begin}
     plan.about = {
         "scene": scene.name, "scene_hash": scene.hash, "component": component, "light_sets": len(lights), "seed": seed,

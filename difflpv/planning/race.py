@@ -7,7 +7,8 @@ is rejected or, on the last level, surely below the tolerance; what lies above t
 - once others that were judged more closely foretell it: rungs see the same receivers and lights, so the ratio of what a later
   level found to what this one did is much the same for all; the most hopeful ratio seen is taken, and a margin with it;
 - before it is judged, where coarser cells of its family foretell it even if the error fell with the square of their edge, the
-  order at which linear interpolation between cells converges.
+  order at which linear interpolation between cells converges, or as it did between these cells in a family that differs in
+  one trait (its stencil, its occlusion ...), with a margin; and probes where the volume that lights them foretells it.
 
 All three only reject. What is chosen rests on the bounds of the last level alone.
 
@@ -33,8 +34,12 @@ _FINER = 1.5  # times as much work a second may be done in finer cells
 _OTHER_KIND = 2.5  # or by another kind of solve
 _ABOVE_BASE = 3.0  # times the cheapest solve: what takes so long tells the rate of the work
 _ROUGH = 1.25  # a time of one or two runs may be so far off
+_REPEATS = 5  # of a solve whose time decides
+_ENOUGH = 0.1  # s of them: long solves scatter less
 _PREDICTION = 1.5  # a rung predicted to be so many times over the budget is not measured
 _MARGIN = 1.1  # between the ratios of errors on two levels of different rungs
+_FAMILIES = 1.25  # and between what finer cells do to the errors of two families
+_TELLING = 16  # cells from which on they tell it
 _ORDER = 2.0  # power of the cells' edge with which an error falls at best
 
 
@@ -44,18 +49,20 @@ class Judge(Protocol):
     Attributes:
         slack: of each level, >= 1: a rung is out where its error is surely above the tolerance times this. More than 1 where a
             level sees other lights than the last one does, on which the same rung may do better.
+        moving: receivers whose lookups are part of a rung's cost.
     """
 
     slack: Sequence[float]
+    moving: int
 
     def work(self, rung: Configuration) -> float:
         """Products of one solve."""
 
     def judge(self, rung: Configuration, level: int) -> tuple[Estimate, float]:
-        """Error on this level, and seconds of one solve, roughly: the least of all so far."""
+        """Error on this level, and seconds of one solve with its lookups, roughly: the least of all so far."""
 
-    def retime(self, rung: Configuration) -> float:
-        """Seconds of one solve, the least of several; of a rung that was judged."""
+    def retime(self, rung: Configuration, repeats: int = 5) -> float:
+        """Seconds of one solve, the least of all so far and of ``repeats`` more; of a rung that was judged."""
 
 
 @dataclass(eq=False)
@@ -100,11 +107,13 @@ class _Field:
         """Measured, or else the least to be expected: so none comes too late.
 
         That is what the cheapest measured solve costs besides its work, and the work at the best rate seen, taken to be better
-        still for other cells and another kind of solve.
+        still for other cells and another kind of solve. Where lookups count, only what is read alike tells what they cost.
         """
         if runner.seconds is not None or not runner.work:
             return runner.seconds or 0.0
         known = [(r, r.seconds) for r in self.runners if r.seconds is not None and r.work]
+        if self.judge.moving:
+            known = [(r, seconds) for r, seconds in known if _reading(r) == _reading(runner)]
         base = min((seconds for _, seconds in known), default=0.0)
         rates = [(_kind(r), (seconds - base) / r.work) for r, seconds in known if seconds > _ABOVE_BASE * base]
         own = [rate / _FINER for kind, rate in rates if kind == _kind(runner)]
@@ -122,8 +131,8 @@ class _Field:
         self.tell(runner)
         return estimate
 
-    def retime(self, runner: Runner) -> None:
-        runner.seconds = min(self.judge.retime(runner.rung), self.cost(runner) or math.inf) if runner.work else 0.0
+    def retime(self, runner: Runner, repeats: int = _REPEATS) -> None:
+        runner.seconds = min(self.judge.retime(runner.rung, repeats), self.cost(runner) or math.inf) if runner.work else 0.0
 
     def lost(self, estimate: Estimate, level: int, tolerance: float) -> str | None:
         """Why a rung that was so judged on a level is rejected ("out", "unsure"), or None."""
@@ -141,22 +150,54 @@ class _Field:
         return None
 
     def hopeless(self, runner: Runner, tolerance: float) -> bool:
-        """True where coarser cells of the same family would be rejected even if their error fell as fast as it can."""
-        cells = runner.rung.cells
-        if not cells:
-            return False
-        family = [r for r in self.runners if r.estimates and r.rung.cells and family_of(r.rung) == family_of(runner.rung)]
-        for coarser in family:
-            if _cells(coarser) < cells:
-                fall, e = (_cells(coarser) / cells) ** _ORDER, _error(coarser)
-                if self.lost(Estimate(e.error * fall, e.low * fall, e.high * fall), coarser.level, tolerance):
+        """True where what foretells it would be rejected even if its error fell as fast as it can (``fall``)."""
+        for other in self.runners:
+            fall = self.fall(other, runner) if other.estimates else 0.0
+            if fall:
+                e = _error(other)
+                if self.lost(Estimate(e.error * fall, e.low * fall, e.high * fall), other.level, tolerance):
                     return True
         return False
+
+    def fall(self, coarser: Runner, finer: Runner) -> float:
+        """The least share of ``coarser``'s error that may be left with ``finer``; 0 where the one says nothing about the other.
+
+        Of probes in the volume ``coarser``: all but a margin. In finer cells of the same family: the square of the cells' edges
+        or, if it is more, what the same two cell sizes made of the errors of another family that differs in one trait: the
+        most hopeful of those judged, and a margin. Fewer cells than 16 say too little.
+        """
+        if coarser.rung.kind == "volume" and finer.rung.kind == "lit probes" and coarser.rung.config == finer.rung.config:
+            return 1 / _FAMILIES if _cells(coarser) == _cells(finer) else 0.0
+        if not 0 < _cells(coarser) < _cells(finer) or family_of(coarser.rung) != family_of(finer.rung):
+            return 0.0
+        least = (_cells(coarser) / _cells(finer)) ** _ORDER
+        if _cells(coarser) < _TELLING:
+            return least
+        family, first = family_of(finer.rung), {}
+        for r in self.runners:
+            if r.estimates and _cells(r) in (_cells(coarser), _cells(finer)) and _alike(family_of(r.rung), family):
+                first[family_of(r.rung), _cells(r)] = r.estimates[0].error
+        shares = [
+            error / max(first[other, _cells(coarser)], 1e-12)
+            for (other, cells), error in first.items()
+            if cells == _cells(finer) and (other, _cells(coarser)) in first
+        ]
+        return max(least, min(shares, default=0.0) / _FAMILIES)
+
+
+def _alike(one: tuple[object, ...], other: tuple[object, ...]) -> bool:
+    """Whether two families differ in one trait."""
+    return len(one) == len(other) and sum(a != b for a, b in zip(one, other, strict=True)) == 1
 
 
 def _kind(runner: Runner) -> tuple[str, bool] | None:
     config = runner.rung.config
     return None if config is None else (config.method, config.coarsen_after is not None)
+
+
+def _reading(runner: Runner) -> tuple[object, ...]:
+    config = runner.rung.config
+    return (runner.rung.kind, None if config is None else config.lookup)
 
 
 def _cells(runner: Runner) -> int:
@@ -213,8 +254,8 @@ def cheapest(
                 continue
             runner.state = "met"  # times were rough so far: is it the cheapest?
             rivals = [r for r in waiting if r.seconds is not None and race.cost(r) <= _ROUGH * race.cost(runner)]
-            for rival in rivals:
-                race.retime(rival)
+            for rival in rivals if len(rivals) > 1 else ():
+                race.retime(rival, max(1, min(_REPEATS, round(_ENOUGH / max(race.cost(rival), 1e-9)))))
     return None
 
 
