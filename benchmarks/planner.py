@@ -30,6 +30,7 @@ from difflpv.planning.plan import make_plan
 from difflpv.planning.truth import LEVELS, Level
 
 _TIE = 1.1
+_MOVING = (10_000, 1_000_000)
 _WANTED = 0.25  # of the sweep's time
 
 
@@ -59,17 +60,19 @@ def sweep(name: str) -> dict[str, Any]:
     return {"rungs": rungs, "truth": truth, "seconds": time.process_time() - begin}
 
 
-def plan(name: str, tolerance: float) -> dict[str, Any]:
-    """One plan, its words, and the whole processor time."""
+def plan(name: str, tolerance: float, moving: int = 0) -> dict[str, Any]:
+    """One plan, its words, and the whole processor time; with ``moving`` receivers that move."""
     begin = time.process_time()
     with tempfile.TemporaryDirectory() as folder:
-        found = make_plan(load_scene(name), folder, tolerance=tolerance, component=BUNDLED[name][0])
+        found = make_plan(load_scene(name), folder, tolerance=tolerance, component=BUNDLED[name][0], moving=moving)
     chosen = None if found.chosen is None else found.chosen.rung.name
     best = None if found.best is None else found.best.rung.name
     judged = sum(r.level >= 0 for r in found.runners)
-    print(f"{name}, {tolerance:g}: {chosen} (best {best})", flush=True)
+    print(f"{name}, {tolerance:g}, {moving} moving: {chosen} (best {best})", flush=True)
+    error, cost = (None, None) if found.best is None else (found.best.estimate.error, found.best.seconds)
     return {
         "chosen": chosen, "best": best, "words": explain(found), "judged": judged, "seconds": time.process_time() - begin,
+        "error": error, "cost": cost,
     }  # fmt: skip
 
 
@@ -133,6 +136,7 @@ def page(results: dict[str, Any], tolerances: list[float], command: str) -> str:
         + ". A sweep serves all tolerances at once, a plan one. Dear are tolerances near what the best rungs reach: then many "
         "are judged under all lights, and on the last level, whose truth alone takes "
         f"{_share_of_truth(results)} of a sweep's time.", "",
+        *_moving_table(results, max(tolerances)),
         "## In the planner's words", "",
         "Errors are those of the last level on which a rung was judged: what is rejected early is known roughly, and under "
         "the first light only.", "",
@@ -146,6 +150,31 @@ def page(results: dict[str, Any], tolerances: list[float], command: str) -> str:
             lines += [f"- {words[0]}. {words[-1] if len(words) > 1 else ''}".rstrip()]
         lines.append("")
     return "\n".join(lines)
+
+
+def _moving_table(results: dict[str, Any], tolerance: float) -> list[str]:
+    """What is chosen where receivers move."""
+    counts = (0, *_MOVING)
+    heads = ["receivers stay", *(f"{n:,} move" for n in _MOVING)]
+    lines = [
+        "## Where receivers move", "",
+        f"`difflpv plan SCENE --tolerance {tolerance:g} --moving N`: a rung's time counts what N receivers, as on objects that "
+        "move, take after each solve to find out anew what they see, and to read it. In cells that is 27 rays a receiver; in "
+        "light probes that the volume lights, a walk through tetrahedra, which knows no walls. Each entry: rung; error; time "
+        "of the solve with its lookups [ms], one thread.", "",
+        f"| scene | {' | '.join(heads)} |", "|---" * (len(heads) + 1) + "|",
+    ]  # fmt: skip
+    for name, result in results.items():
+        plans = [result["plans"][_key(tolerance, n)] for n in counts]
+        cells = [
+            "none meets it" if p["chosen"] is None else f"{p['chosen']}; {p['error']:.3f}; {1e3 * p['cost']:.1f}" for p in plans
+        ]
+        lines.append(f"| {name} {BUNDLED[name][0]} | {' | '.join(cells)} |")
+    return [*lines, ""]
+
+
+def _key(tolerance: float, moving: int = 0) -> str:
+    return f"{tolerance:g}" + (f", {moving} moving" if moving else "")
 
 
 def _share_of_truth(results: dict[str, Any]) -> str:
@@ -173,9 +202,10 @@ def main(argv: list[str] | None = None) -> None:
     for name in args.scenes:
         kept = args.folder / f"{name}.json"
         result = json.loads(kept.read_text()) if kept.exists() else {"plans": {}}
-        for tolerance in args.tolerances:
-            if f"{tolerance:g}" not in result["plans"]:
-                result["plans"][f"{tolerance:g}"] = plan(name, tolerance)
+        wanted = [(tolerance, 0) for tolerance in args.tolerances] + [(max(args.tolerances), n) for n in _MOVING]
+        for tolerance, moving in wanted:
+            if _key(tolerance, moving) not in result["plans"]:
+                result["plans"][_key(tolerance, moving)] = plan(name, tolerance, moving)
                 write_json(kept, result)
         if "sweep" not in result:
             result["sweep"] = sweep(name)

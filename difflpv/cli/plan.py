@@ -101,6 +101,8 @@ def run(args: argparse.Namespace) -> int:
         print(f"\n{scene.name}, {args.component}: {explain(plan)}")
         if plan.best is not None:
             print(f"\nplanning took {plan.seconds['all']:.0f} s, {plan.seconds['truth']:.0f} s of it for truth -> {args.out}")
+        if plan.config is not None:
+            print(f"to use it: difflpv render {args.scene} --config {args.out} --out {args.out.with_suffix('.exr')}")
     if plan.interrupted:
         return INTERRUPTED
     return 0 if plan.chosen is not None else 1

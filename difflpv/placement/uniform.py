@@ -64,7 +64,7 @@ def uniform_grids(
         spread: scale about the centre of the box.
         margin: if given, probes in solids are first moved out of them, this share of the smallest spacing off the surface.
         refinements: finer grids that are tried; enough to miss hardly any by default, which takes seconds where a scene has
-            many triangles. 0: one grid of ``count``, with its free probes.
+            many triangles. 0: one grid of the best proportions and ``count`` probes alone, with those of them that are free.
 
     Returns:
         Up to three such grids, and up to three of ``count`` probes, with their free probes alone; none if no grid has any.
@@ -72,7 +72,8 @@ def uniform_grids(
     low, high = task.bounds
 
     def fitting(total: int) -> list[UniformGrid]:
-        grids = [_free(task, _grid(low, high, shape, spread), margin) for shape in _shapes(high - low, total)[:_SHAPES]]
+        shapes = _shapes(high - low, total)[: 1 if refinements == 0 else _SHAPES]
+        grids = [_free(task, _grid(low, high, shape, spread), margin) for shape in shapes]
         return [grid for grid in grids if 0 < len(grid.position) <= count]
 
     plain = best = fitting(count)

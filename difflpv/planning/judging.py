@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -36,6 +36,7 @@ __all__ = ["SceneJudge"]
 
 _Volume = tuple[LpvConfig, int | None]  # what is solved, but for its lookup, in so many cells
 
+_MANY = 4000  # receivers whose lookups are timed
 _SHORT = 0.02  # s: what is shorter is timed twice
 _KEPT = 256 * 2**20  # bytes of solved volumes
 
@@ -87,10 +88,9 @@ class SceneJudge:
         self._receivers: dict[Any, Receivers] = {}
         self._solved: OrderedDict[tuple[_Volume, int], tuple[torch.Tensor, ...]] = OrderedDict()
         self._seconds: dict[_Volume, float] = {}  # of a solve
-        self._probes: dict[str, LpvConfig] = {}
+        self._probes: dict[int, tuple[tuple[float, float, float], ...]] = {}  # positions by number
         self._lighting: dict[str, float] = {}  # s to light a rung's probes
-        self._finding: dict[Any, float] = {}  # s a receiver, to find out what it sees
-        self._reading: dict[str, float] = {}  # s a receiver, both
+        self._reading: dict[str, float] = {}  # s a receiver of a rung, to find out what it sees and read it
         self._warm: set[tuple[Any, ...]] = set()
 
     def grid(self, rung: Configuration) -> Grid:
@@ -125,10 +125,10 @@ class SceneJudge:
         """What solves a rung, with the places of its probes in this scene; None for what solves nothing."""
         if rung.config is None or rung.probes is None:
             return rung.config
-        if rung.name not in self._probes:
-            position = probe_grid(self.scene, self.grid(rung), rung.probes, seed=self.seed, refinements=0)
-            self._probes[rung.name] = replace(rung.config, probes=tuple(map(tuple, position.tolist())))
-        return self._probes[rung.name]
+        if rung.probes not in self._probes:
+            position = probe_grid(self.scene, grid_for(self.scene), rung.probes, seed=self.seed, refinements=0)
+            self._probes[rung.probes] = tuple((x, y, z) for x, y, z in position.tolist())
+        return replace(rung.config, probes=self._probes[rung.probes])
 
     def seconds(self, rung: Configuration) -> float:
         """Time of a solve and its lookups [s], the least so far of each; 0 for what was not judged or solves nothing."""
@@ -149,7 +149,7 @@ class SceneJudge:
             number = min(self._levels[min(self._levels)].sets) if self._levels else 0
             light = self._illuminate(config, self.grid(rung), number)
             for _ in range(repeats):
-                self._lit(rung, light, self._timed(rung, light))
+                self._time_reading(rung, light, self._timed(rung, light))
         self.spent["rungs"] += time.perf_counter() - begin
         return self.seconds(rung)
 
@@ -161,21 +161,18 @@ class SceneJudge:
         volume = self._volume(rung)
         key = (volume, number)
         if key not in self._solved:
+            first = volume not in self._seconds
             self._solved[key] = self._timed(rung, light)
             kind = (config.method, config.occlusion, config.coarsen_after is None)
-            if self._seconds[volume] < _SHORT or kind not in self._warm:  # the first of a kind loads its kernels
+            if (first and self._seconds[volume] < _SHORT) or kind not in self._warm:  # the first of a kind loads its kernels
                 self._warm.add(kind)
                 self._timed(rung, light)
             while len(self._solved) > 1 and sum(map(_size, self._solved.values())) > _KEPT:
                 self._solved.popitem(last=False)
-        lpv, solved, parts = Lpv(grid, config), self._solved[key], []
-        self._lit(rung, light, solved)
-        for part in truth.parts:
-            seen, finding = self._seen(config, grid, light, part, number)
-            begin = _clock()
-            parts.append(lpv.gather(solved, light, seen))
-            each = finding + (_clock() - begin) / len(seen)
-            self._reading[rung.name] = min(each, self._reading.get(rung.name, np.inf))
+        lpv, solved = Lpv(grid, config), self._solved[key]
+        if number == truth.sets[0]:
+            self._time_reading(rung, light, solved)
+        parts = [lpv.gather(solved, light, self._seen(config, grid, light, part, number)) for part in truth.parts]
         return torch.cat(parts).double().numpy()
 
     def _timed(self, rung: Configuration, light: Illumination) -> tuple[torch.Tensor, ...]:
@@ -184,13 +181,25 @@ class SceneJudge:
         self._seconds[volume] = min(_clock() - begin, self._seconds.get(volume, np.inf))  # what disturbs can only add
         return solved
 
-    def _lit(self, rung: Configuration, light: Illumination, solved: Sequence[torch.Tensor]) -> None:
-        """Time the lighting of a rung's probes."""
+    def _time_reading(self, rung: Configuration, light: Illumination, solved: Sequence[torch.Tensor]) -> None:
+        """Time what lights a rung's probes and, where receivers move, their lookups."""
         if rung.probes is not None:
-            gains, reads = torch.ones(COEFFS), light.probes.reads
+            grids, reads, gains = light.config.grids(light.grid), light.probes.reads, torch.ones(COEFFS)
+            self._least(self._lighting, rung.name, lambda: probe_radiance(solved, grids, reads, gains))
+        if self.moving:
+            table, lpv = self.truth.receivers(0), Lpv(light.grid, light.config)
+            position, normal = (np.resize(a, (_MANY, 3)).astype(float) for a in (table.position, table.normal))
+            self._least(
+                self._reading, rung.name, lambda: lpv.gather(solved, light, light.receivers(position, normal)), count=_MANY
+            )
+
+    def _least(self, known: dict[str, float], name: str, work: Callable[[], object], *, count: int = 1) -> None:
+        """Keep the least time of ``work`` over ``count``; the first is not counted, for it loads kernels and tables."""
+        for again in (False, True) if name not in known else (True,):
             begin = _clock()
-            probe_radiance(solved, light.config.grids(light.grid), reads, gains)
-            self._lighting[rung.name] = min(_clock() - begin, self._lighting.get(rung.name, np.inf))
+            work()
+            if again:
+                known[name] = min((_clock() - begin) / count, known.get(name, np.inf))
 
     def _illuminate(self, config: LpvConfig, grid: Grid, number: int) -> Illumination:
         """The scene under a light set; VPLs and the cells that they give to are ready: no part of a solve."""
@@ -216,20 +225,13 @@ class SceneJudge:
         moved = not np.array_equal(self.truth.lit(number).triangle_vertices, self.scene.triangle_vertices)
         return number if moved else -1
 
-    def _seen(
-        self, config: LpvConfig, grid: Grid, light: Illumination, part: int, number: int
-    ) -> tuple[Receivers, float]:
-        """A part's receivers with what they see, and the seconds that one took to find out."""
+    def _seen(self, config: LpvConfig, grid: Grid, light: Illumination, part: int, number: int) -> Receivers:
         lights = number if self.component == "direct" else self._geometry(number)  # direct: shadow rays to each light
         key = (part, lights, grid, config.lookup, len(config.grids(grid)), config.probes)
         if key not in self._receivers:
             table = self.truth.receivers(part)
-            if config.probes:
-                _ = light.probes  # where they stand is no matter of the receivers
-            begin = _clock()
             self._receivers[key] = light.receivers(table.position.astype(float), table.normal.astype(float))
-            self._finding[key] = (_clock() - begin) / len(table)
-        return self._receivers[key], self._finding[key]
+        return self._receivers[key]
 
     def _truth_of(self, level: int) -> LevelTruth:
         if level not in self._levels:

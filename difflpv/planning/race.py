@@ -37,7 +37,8 @@ _ROUGH = 1.25  # a time of one or two runs may be so far off
 _REPEATS = 5  # of a solve whose time decides
 _ENOUGH = 0.1  # s of them: long solves scatter less
 _PREDICTION = 1.5  # a rung predicted to be so many times over the budget is not measured
-_MARGIN = 1.1  # between the ratios of errors on two levels of different rungs
+_MARGIN = 1.1  # between the ratios of errors on two levels of two rungs
+_MARGIN_OF_SEVERAL = 1.05  # and between the most hopeful of several and another
 _FAMILIES = 1.25  # and between what finer cells do to the errors of two families
 _TELLING = 16  # cells from which on they tell it
 _ORDER = 2.0  # power of the cells' edge with which an error falls at best
@@ -145,14 +146,21 @@ class _Field:
             final = later == last
             ratios = [(e[later].high if final else e[later].error) / max(e[level].error, 1e-12) for e in known]
             # how far a bound lies above the error differs more between rungs: two have to agree
-            if len(ratios) >= (2 if final else 1) and estimate.error * min(ratios) > tolerance * _MARGIN:
+            margin = _MARGIN if len(ratios) == 1 else _MARGIN_OF_SEVERAL
+            if len(ratios) >= (2 if final else 1) and estimate.error * min(ratios) > tolerance * margin:
                 return "unsure"
+        # with twice the receivers, one in twenty whose error is above here will have its upper bound within the tolerance there
+        if level == last - 1 and self.judge.slack[level] == 1 and estimate.error > tolerance:
+            return "unsure"
         return None
 
     def hopeless(self, runner: Runner, tolerance: float) -> bool:
-        """True where what foretells it would be rejected even if its error fell as fast as it can (``fall``)."""
+        """True where what foretells it would be rejected even if its error fell as fast as it can (``fall``).
+
+        One that was judged itself is foretold only by what was judged more closely.
+        """
         for other in self.runners:
-            fall = self.fall(other, runner) if other.estimates else 0.0
+            fall = self.fall(other, runner) if other.level > runner.level else 0.0
             if fall:
                 e = _error(other)
                 if self.lost(Estimate(e.error * fall, e.low * fall, e.high * fall), other.level, tolerance):
@@ -236,16 +244,12 @@ def cheapest(
         if runner.state == "met":
             runner.state = "chosen"
             return runner
-        if runner.level < 0 and race.hopeless(runner, tolerance):
+        if race.hopeless(runner, tolerance):
             runner.state = "hopeless"
             continue
         lost = race.lost(runner.estimates[-1], runner.level, tolerance) if runner.estimates else None  # others came later
         if lost is None:
             lost = race.lost(race.advance(runner, runner.level + 1), runner.level, tolerance)
-        if lost is None and runner.level == last - 1 and judge.slack[last - 1] == 1:
-            e = _error(runner)
-            if (e.low + e.error) / 2 > tolerance:  # four in five say that the last level's error, too, is above
-                lost = "unsure"
         if lost is not None:
             runner.state = lost
         elif runner.level == last:
