@@ -34,7 +34,7 @@ _STREAM = 101  # names this file's random streams
 _PATHS = 2**15
 _ESCAPE_RAYS = 32
 _LIT_SHARE = 0.01
-_SEARCH = 1024  # paths from each side of a point that looks enclosed
+_SEARCH = 64 * REPLICATES  # paths from each side of a point that looks enclosed
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def draw_receivers(
         count: number of receivers.
         seed: equal seeds draw equal receivers.
         within: only where this grid reaches; everywhere if None.
-        search: paths from each side of a point that looks enclosed, a multiple of 16. They take most of the time where
+        search: paths from each side of a point that looks enclosed, a multiple of 32. They take most of the time where
             objects stand on one another; fewer take the dimmest corners for buried.
         expected_share: of the area that does not emit, what is known to be neither buried nor outside the grid, as from an
             earlier draw: so much more is drawn at once. Only the time depends on how right it is.

@@ -7,6 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from data_gen import receivers
+from data_gen.distance import triangle_distance
 from data_gen.freespace import draw_probes
 from data_gen.receivers import draw_receivers
 from difflpv.io import load_scene
@@ -63,6 +65,33 @@ def test_buried_area_is_left_out():
     assert (weight == weight[0]).all()
     assert weight.sum() == pytest.approx(96 - 1 + 5, rel=0.01)
     assert weight[table.extras["mesh_id"] == 1].sum() == pytest.approx(5, rel=0.1)
+
+
+def test_what_is_known_to_be_buried_saves_a_second_draw(monkeypatch):
+    """Of 102 m2, the block's bottom and the floor below it are buried: one draw instead of two, for the same area."""
+    drawn, real = [], receivers._draw_points
+    monkeypatch.setattr(receivers, "_draw_points", lambda *args: drawn.append(args[2]) or real(*args))
+    plain = draw_receivers(room(), 2000, 0)
+    assert drawn[0] == 2000 and len(drawn) == 2
+    drawn.clear()
+    known = draw_receivers(room(), 2000, 0, expected_share=0.95, search=256)
+    assert drawn == [2106]  # ceil(2000 / 0.95)
+    for table in (plain, known):
+        assert len(table) == 2000
+        np.testing.assert_allclose(table.area_weight.sum(), 100.0, rtol=0.01)  # 96 - 1 and 6 - 1 m2
+        share = (table.extras["mesh_id"] == 1).mean()  # 5 of 100 m2
+        assert abs(share - 0.05) < 4 * np.sqrt(0.05 * 0.95 / 2000)
+
+
+@pytest.mark.parametrize("options, message", [
+    ({"search": 8}, "search: expected a multiple of 32 paths, got 8"),
+    ({"search": 100}, "search: expected a multiple of 32 paths, got 100"),
+    ({"expected_share": 0.0}, r"expected_share: expected a number in \(0, 1\], got 0"),
+    ({"expected_share": 1.5}, r"expected_share: expected a number in \(0, 1\], got 1.5"),
+])  # fmt: skip
+def test_options_of_a_draw(options, message):
+    with pytest.raises(ValueError, match=message):
+        draw_receivers(room(), 10, 0, **options)
 
 
 def test_unlit_back_of_an_object_in_the_open_is_kept():

@@ -64,6 +64,8 @@ def test_a_solver_says_when_the_budget_ends_before_its_model(task):
 def test_grid_counts_what_lies_in_free_space_and_keeps_cubic_proportions():
     open_box = analytic_task(wall=False, ambient=1.0)
     (grid, *_), (low, high) = uniform_grids(open_box, 54), open_box.bounds
+    (only,) = uniform_grids(open_box, 54, refinements=0)
+    np.testing.assert_array_equal(only.position, grid.position)
     assert grid.shape == (6, 3, 3) and len(grid.position) == 54  # the box is twice as long as it is high
     np.testing.assert_allclose(grid.position.mean(0), (low + high) / 2)
     np.testing.assert_allclose(grid.position.max(0) - grid.position.min(0), (high - low) * (1 - 1 / np.array([6, 3, 3])))

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -167,12 +168,28 @@ def test_a_small_scene_from_end_to_end(tmp_path):
     assert again.runners[0].estimate == next(r for r in plan.runners if r.rung == rungs[0]).estimate
 
 
+def test_a_plan_of_probes_is_a_file_with_their_places(tmp_path):
+    volume = next(r for r in PLAN_LADDER if r.name == "learned_9x26, 8 cells, 8 steps")
+    rung = replace(volume, name="8 probes", kind="lit probes", family="LPV-lit probes", probes=8)
+    levels = (Level(60, 32, 1, 1.2), Level(60, 32, 1))
+    scene = panel_scene(floor=2.0)
+    plan = make_plan(scene, tmp_path, tolerance=9.0, component="direct", rungs=[rung], levels=levels, moving=1000)
+    assert plan.chosen is not None and len(plan.probes) == len(plan.config.probes) > 0
+    assert "a solve with the lookups of 1000 receivers that move" in explain(plan)
+    plan.save(tmp_path / "plan.json")
+    file = read_config_file(tmp_path / "plan.json")
+    assert file.config == plan.config and file.cells == 8 and file.scene == (scene.name, scene.hash)
+    with pytest.raises(ValueError, match="moving: expected a number of receivers >= 0, got -1"):
+        make_plan(scene, tmp_path, tolerance=1.0, moving=-1)
+
+
 @pytest.mark.parametrize("arguments, message", [
     (["plan", "cornell"], "one of the arguments --tolerance --budget-ms is required"),
     (["plan", "cornell", "--tolerance", "0.2", "--budget-ms", "5"], "not allowed with"),
     (["plan", "cornell", "--tolerance", "-1"], "expected a number above 0"),
     (["plan", "cornell", "--tolerance", "0.2", "--confidence", "1"], "--confidence: expected a number in [0.5, 1), got 1"),
     (["plan", "cornell", "--tolerance", "0.2", "--out", "plan.txt"], "--out: expected a file name ending in .json"),
+    (["plan", "cornell", "--tolerance", "0.2", "--moving", "many"], "--moving"),
     (["plan", "nowhere.glb", "--tolerance", "0.2"], "nowhere.glb"),
 ])  # fmt: skip
 def test_bad_input_is_one_line(arguments, message, capsys, tmp_path, monkeypatch):

@@ -1,5 +1,7 @@
 """Truth by levels, and the judge on a small scene: nothing twice, and bounds that hold against many more receivers."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hand_scenes import panel_scene
@@ -106,6 +108,42 @@ def test_lights_carried_over_to_other_cells_are_the_same_as_traced_anew(config):
         found = [Lpv(grid, config)(light, light.receivers(position, normal)) for light in (anew, carried)]
         assert found[0].abs().max() > 0
         assert found[0].tolist() == found[1].tolist()
+
+
+PROBES = replace(SMALL, name="8 probes", kind="lit probes", family="LPV-lit probes", probes=8)
+
+
+def test_probes_read_the_volume_that_was_solved_for_another_rung(tmp_path, monkeypatch):
+    solves, real = [], Lpv.accumulate
+    monkeypatch.setattr(Lpv, "accumulate", lambda self, *args, **kwargs: solves.append(1) or real(self, *args, **kwargs))
+    monkeypatch.setattr("difflpv.planning.judging._SHORT", 0.0)
+    judge = judge_of(tmp_path)
+    _, seconds = judge.judge(SMALL, 1)
+    count = len(solves)
+    estimate, more = judge.judge(PROBES, 1)
+    assert len(solves) == count
+    assert more > seconds  # they are lit, too
+    config = judge.config(PROBES)
+    assert config.probes and replace(config, probes=()) == SMALL.config
+    truth, found = judge.truth.level(1), []
+    table = judge.truth.receivers(0)
+    for number in truth.sets:
+        light = illuminate(judge.truth.lit(number), judge.grid(PROBES), config, "direct")
+        lpv = Lpv(light.grid, config)
+        found.append(lpv(light, light.receivers(table.position, table.normal)).detach().double().numpy())
+    anew = ErrorSamples.of(np.stack(found), truth.irradiance, truth.standard_error, truth.weight).estimate()
+    assert estimate.error == pytest.approx(anew.error, rel=1e-5)
+    assert judge.retime(PROBES, 1) <= more
+
+
+def test_moving_receivers_add_their_lookups_to_the_time(tmp_path):
+    still, moving = judge_of(tmp_path), judge_of(tmp_path, moving=10**6)
+    for judge in (still, moving):
+        for rung in (SMALL, PROBES):
+            judge.judge(rung, 0)
+    # a million receivers look up for longer than a volume of 8 cells takes to solve; in probes, without rays, for less
+    assert moving.seconds(SMALL) > 10 * still.seconds(SMALL)
+    assert moving.seconds(PROBES) < moving.seconds(SMALL)
 
 
 @pytest.mark.slow
