@@ -209,6 +209,18 @@ def test_times_are_repeated_for_what_meets_the_tolerance_and_its_rivals_only():
     assert set(judge.timed) <= {"rung 1", "rung 2"}
 
 
+def test_a_slow_first_run_does_not_put_a_rung_over_the_budget():
+    class Cold(KnownJudge):
+        def rough(self, rung):
+            return 3 * self.times[rung.name]
+
+    rungs = rungs_of(3)
+    judge = Cold({"rung 0": 0.5, "rung 1": 0.2, "rung 2": 0.1}, {"rung 0": 1.0, "rung 1": 4.0, "rung 2": 30.0})
+    plan = plan_with(judge, rungs, budget=5.0)
+    assert plan.chosen.rung.name == "rung 1" and plan.chosen.seconds == 4.0
+    assert plan.runners[2].state == "dear" and "rung 2" not in judge.timed
+
+
 @pytest.mark.parametrize("scale, most", [(1.005, 0.05), (1.3, 0.0)])
 def test_chance_gets_a_bad_rung_chosen_no_oftener_than_the_confidence_says(scale, most):
     """Real bootstrap bounds, and levels that share receivers: an error of 1.005 or 1.3 tolerances may pass by chance."""

@@ -36,6 +36,7 @@ _ABOVE_BASE = 3.0  # times the cheapest solve: what takes so long tells the rate
 _ROUGH = 1.25  # a time of one or two runs may be so far off
 _REPEATS = 5  # of a solve whose time decides
 _ENOUGH = 0.1  # s of them: long solves scatter less
+_COLD = 4.0  # times a first run on a busy machine may take
 _PREDICTION = 1.5  # a rung predicted to be so many times over the budget is not measured
 _MARGIN = 1.1  # between the ratios of errors on two levels of two rungs
 _MARGIN_OF_SEVERAL = 1.05  # and between the most hopeful of several and another
@@ -281,7 +282,7 @@ def most_accurate(
                 runner.state = "dear"
                 continue
             race.advance(runner, level)
-            if level == len(judge.slack) - 1:
+            if level == len(judge.slack) - 1 or budget < race.cost(runner) <= _COLD * budget:
                 race.retime(runner)
             if race.cost(runner) > budget * (1 if level == len(judge.slack) - 1 else _ROUGH):
                 runner.state = "dear"
