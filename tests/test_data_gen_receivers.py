@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from data_gen import receivers
-from data_gen.distance import triangle_distance
 from data_gen.freespace import draw_probes
 from data_gen.receivers import draw_receivers
 from difflpv.io import load_scene
