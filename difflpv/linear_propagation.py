@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from difflpv.bridge import as_warp, refuse_second_derivative, warp_scalar
-from difflpv.padded import Layout, SlabLauncher, Spans, kept_volumes, last_bar, march, steps_back, volumes_between
+from difflpv.padded import Layout, SlabLauncher, Spans, kept_volumes, last_bar, march, nest, steps_back, volumes_between
 from difflpv.stencil import pair_offsets
 from warp_kernels.linear_propagation import cpu_lanes, matrices_kernel, step_kernel
 
@@ -89,6 +89,11 @@ class _Steps:
         where = spans.arguments(moving, into)
         self._step(moving, into, total, self._none, self._none, self._none, step, where, weights="weights")
 
+    def nested(self, inner: torch.Tensor, into: torch.Tensor, injected: torch.Tensor, step: int, spans: Spans) -> None:
+        """``injected`` (flat, without halo) and what this step makes of ``inner``, ``into``; flat padded buffers."""
+        where = spans.arguments(inner, into)
+        self._step(inner, into, injected, self._none, self._none, self._none, step, where, weights="weights", nested=True)
+
     def adjoint(
         self, after: torch.Tensor, into: torch.Tensor, total_bar: torch.Tensor, before: torch.Tensor | None,
         transmittance_bar: torch.Tensor, factor_bar: torch.Tensor, step: int,
@@ -154,7 +159,14 @@ def _propagate(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
     layout = _layout(volume)
     steps = _Steps(layout, matrices, factors, transmittance, offsets, occlude_first_step)
-    spans = Spans(layout, volume, len(factors), read_box)
+    # all steps alike but for their factor, and nothing asked for but the sum
+    nested = not (keep or tolerance or want_moving) and (occlude_first_step or not steps.occluded)
+    spans = Spans(layout, volume, len(factors), read_box, last_first=nested)
+    if nested:
+        total = nest(layout, volume, len(factors), steps.nested, spans)
+        steps.launcher.release()
+        states = kept_volumes(layout, volume, len(factors), keep)
+        return layout.unpad(total), volume.new_empty(0), states, torch.tensor(len(factors))
     total, moving, states, done = march(layout, volume, len(factors), keep, tolerance, steps.forward, spans)
     steps.launcher.release()
     rest = layout.unpad(moving) if want_moving else volume.new_empty(0)

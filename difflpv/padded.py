@@ -7,7 +7,8 @@ memory than aligned access saves.)
 
 Adjoint of A = sum_i S_i with S_{i+1} = F_i(S_i): G_N = Abar (and the cotangent of S_N, where that is asked for too),
 G_i = Abar + (dF_i/dS)^T G_{i+1}, and the volume's gradient is G_0. Volumes are kept only where that derivative or a
-learnable of the propagation needs them. Without any a solve holds three: the moving one, the next one, their sum.
+learnable of the propagation needs them. Without any a solve holds three: the moving one, the next one, their sum; one whose
+steps commute and of which nothing but the sum is asked for, two (``nest``).
 
 On the CPU a step leaves out cells that no light has reached and cells that can no longer reach what is read
 (``warp_kernels.row_spans``); ``Spans`` holds what it needs for that.
@@ -27,7 +28,9 @@ import torch
 
 from difflpv.bridge import as_warp, record, replay
 
-__all__ = ["Forward", "Layout", "SlabLauncher", "Spans", "kept_volumes", "last_bar", "march", "steps_back", "volumes_between"]
+__all__ = [
+    "Forward", "Layout", "SlabLauncher", "Spans", "kept_volumes", "last_bar", "march", "nest", "steps_back", "volumes_between",
+]  # fmt: skip
 
 _KEEP_ALL_BYTES = 2**30
 
@@ -100,8 +103,9 @@ class Spans:
     """Where light is in the buffers of one solve: spans of their rows, and the box that each step has to fill."""
 
     def __init__(
-        self, layout: Layout, like: torch.Tensor, steps: int, read_box: Sequence[int] = (), *, groups: int = 1
-    ) -> None:
+        self, layout: Layout, like: torch.Tensor, steps: int, read_box: Sequence[int] = (), *, groups: int = 1,
+        last_first: bool = False,
+    ) -> None:  # fmt: skip
         """Set up.
 
         Args:
@@ -110,10 +114,11 @@ class Spans:
             steps: of the solve.
             read_box: cells that are read at the end, (z, y, x) as (begin, end) pairs; empty: all.
             groups: channel groups that keep spans of their own.
+            last_first: the last step is taken first (``nest``).
         """
         size = np.array([layout.z, layout.y, layout.x])
         box = np.array(read_box, np.int64).reshape(-1, 2) if len(read_box) else np.stack([0 * size, size], 1)
-        left = np.arange(steps - 1, -1, -1)[:, None, None]  # light goes one cell a step
+        left = np.arange(steps)[:: 1 if last_first else -1, None, None]  # light goes one cell a step
         needed = np.clip(box + left * np.array([-1, 1]), 0, size[:, None])
         dark = np.zeros((groups, layout.z + 2, layout.y + 2, 2), np.int32)
         dark[..., 0] = layout.x
@@ -221,6 +226,21 @@ def march(
                 return total, home(step), states, step
         forward(home(step), home(step + 1), total, step, spans)
     return total, home(steps), states, steps
+
+
+def nest(layout: Layout, volume: torch.Tensor, steps: int, nested: Forward, spans: Spans) -> torch.Tensor:
+    """All steps of a linear stencil, the last one first: padded accumulated intensity S_0 + F_1 (S_0 + F_2 (S_0 + ..)).
+
+    That is their sum only where the steps commute, as those of one stencil behind one transmittance do, whatever their factors.
+    Two buffers instead of three, but no moving volume to keep, to ask for, or to stop at.
+    """
+    inner, into = layout.pad(volume), layout.empty(layout.fields, volume)
+    spans.mark_dark(into)
+    injected = volume.reshape(-1)
+    for step in reversed(range(steps)):
+        nested(inner, into, injected, step, spans)
+        inner, into = into, inner
+    return inner
 
 
 def last_bar(layout: Layout, total_bar: torch.Tensor, moving_bar: torch.Tensor, padded: torch.Tensor) -> torch.Tensor:

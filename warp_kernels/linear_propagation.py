@@ -5,6 +5,9 @@ Step (physics.md, "The chain" 5, with one matrix per offset), S [W/sr] the movin
     q[d]  = A_0 S[d] + sum_{pairs n > 0} A_n T[n,d-n] S[d-n] + A_{-n} T[n,d] S[d+n]
     S'[d] = p q[d],   A[d] += S'[d]
 
+``nested`` is the same sum from the inside out, A' = S_0 + p q(A) with the last step first (Horner): no third buffer, for what
+is added is the injected volume itself, ``accumulated`` [C,K,n_z,n_y,n_x] without a halo.
+
 T[n,c] is the share that passes between c and c + n, the same both ways [1]. It is zero where c or c + n is outside.
 
 Adjoint, G the adjoint of S': the same gather, for T belongs to the pair and not to its direction. Only the weights change:
@@ -65,6 +68,12 @@ _STEP = (
     for (int x = x_begin; x < x_end; x += LANES) {
         const long long at = line * volume_line + c * COEFFS * pitch + x + 1;
         SPANS_SKIP
+        const long long source_pitch = (long long)z_size * y_size * x_size;
+        const long long source = c * COEFFS * source_pitch + ((long long)z * y_size + y) * x_size + x;
+#if !defined(__CUDA_ARCH__)
+        if (NESTED)  // its fields lie far apart: a tenth of a step
+            for (int k = 0; k < COEFFS; ++k) __builtin_prefetch(accumulated.data + source + k * source_pitch);
+#endif
         V flux[COEFFS], u[COEFFS], v[COEFFS];
         #pragma unroll
         for (int k = 0; k < COEFFS; ++k) {
@@ -132,12 +141,19 @@ _STEP = (
             SCALAR* out = next.data + at + k * pitch;
             SCALAR* sum = accumulated.data + at + k * pitch;
             if (NEED_FACTOR) factor_sum += flux[k] * *(const V*)(before.data + at + k * pitch);
-            const V value = ADJOINT ? *(const V*)sum + flux[k] * p : flux[k] * p;
+            V value = flux[k] * p;
+            if (NESTED) {
+                const long long from = source + k * source_pitch;
+                if (from + LANES <= channels * COEFFS * source_pitch) value += *(const V*)(accumulated.data + from);
+                else  // the end of the memory
+                    for (int lane = 0; lane < x_size - x; ++lane) ((SCALAR*)&value)[lane] += accumulated.data[from + lane];
+            }
+            if (ADJOINT) value += *(const V*)sum;
             *(V*)out = value;
-            if (!ADJOINT) *(V*)sum = *(const V*)sum + value;
+            if (!ADJOINT && !NESTED) *(V*)sum = *(const V*)sum + value;
             for (int lane = x_size - x; lane < LANES; ++lane) {  // keep the halo zero
                 out[lane] = 0;
-                if (!ADJOINT) sum[lane] = 0;
+                if (!ADJOINT && !NESTED) sum[lane] = 0;
             }
             if (x == 0) out[-1] = 0;  // and make it so where ``next`` is fresh memory
             if (x + LANES >= x_size) out[LANES] = 0;
@@ -238,7 +254,7 @@ def _snippet(text: str, scalar: Any, **constants: int) -> str:
 
 @lru_cache
 def step_kernel(
-    scalar: Any, *, coeffs: int, lanes: int, paired: bool, occluded: bool, adjoint: bool = False,
+    scalar: Any, *, coeffs: int, lanes: int, paired: bool, occluded: bool, adjoint: bool = False, nested: bool = False,
     need_factor: bool = False, need_transmittance: bool = False,
 ) -> Any:  # fmt: skip
     """One step forward, or of the adjoint: scalar type, K, lanes (1: a thread per cell, CUDA), flags."""
@@ -246,7 +262,7 @@ def step_kernel(
     text = fill_spans(_STEP, used=lanes > 1 and not adjoint, group="0", fields=coeffs, at="at")
     text = _snippet(
         text, scalar, coeffs=coeffs, lanes=lanes, paired=paired, occluded=occluded, adjoint=adjoint,
-        need_factor=need_factor, need_transmittance=need_transmittance,
+        nested=nested, need_factor=need_factor, need_transmittance=need_transmittance,
     )  # fmt: skip
 
     @wp.func_native(text)

@@ -242,8 +242,10 @@ def _growth(result: BenchResult, folder: str, names: dict[str, str]) -> str:
     lines += [
         "",
         f"Peak memory of propagation without gradients beyond the injected volume, in volumes: {opened} where nothing blocks.",
-        f"That is three buffers (the moving light, the next, their sum) with a halo of one cell, which are {buffers} volumes",
-        f"at these sizes. With occlusion {peak}: a padded copy of the transmittance, 13 numbers beside the 27 of a cell.",
+        f"That is two buffers with a halo of one cell, which are {buffers} volumes at these sizes: all steps are alike, so",
+        "they are summed from the inside out. Three are held where they are not (LPV, HOLPV, a first step that nothing",
+        f"blocks) or a tolerance ends them. With occlusion {peak}: a padded copy of the transmittance, 13 numbers",
+        "beside the 27 of a cell.",
         "",
         f"![growth]({folder}/{names['growth']}.png)",
         "",
