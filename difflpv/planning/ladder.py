@@ -68,7 +68,7 @@ def family_of(rung: Configuration) -> tuple[Any, ...]:
     if c is None:
         return (rung.kind,)
     short = c.steps < min(rung.cells or 32, 32)
-    return (rung.kind, rung.probes, c.method, c.occlusion, c.lookup, short, c.coarsen_after is not None)
+    return ((rung.kind, rung.probes), c.method, c.occlusion, c.lookup, short, c.coarsen_after is not None)
 
 
 def work_of(rung: Configuration, grid: Grid) -> float:

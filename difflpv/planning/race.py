@@ -40,7 +40,7 @@ _COLD = 4.0  # times a first run on a busy machine may take
 _PREDICTION = 1.5  # a rung predicted to be so many times over the budget is not measured
 _MARGIN = 1.1  # between the ratios of errors on two levels of two rungs
 _MARGIN_OF_SEVERAL = 1.05  # and between the most hopeful of several and another
-_FAMILIES = 1.25  # and between what finer cells do to the errors of two families
+_FAMILIES = 1.15  # and between what finer cells do to the errors of two families
 _TELLING = 16  # cells from which on they tell it
 _ORDER = 2.0  # power of the cells' edge with which an error falls at best
 
