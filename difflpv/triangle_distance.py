@@ -10,15 +10,20 @@ __all__ = ["TriangleDistance", "triangle_distance"]
 
 
 class TriangleDistance:
-    """Many triangles, sorted once for as many points as are asked about."""
+    """Many triangles, sorted once for as many points as are asked about.
+
+    Attributes:
+        corners: [T,3,3] m.
+        normal: unit, (b-a) x (c-a), of each triangle [T,3].
+    """
 
     def __init__(self, corners: np.ndarray) -> None:
         """Sort triangles ``corners`` [T,3,3] m, none without area."""
         from scipy.spatial import KDTree  # half a second that worker processes need not wait for
 
-        self._corners = corners
+        self.corners = corners
         normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        self._normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+        self.normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
         centers = corners.mean(1)
         radius = np.linalg.norm(corners - centers[:, None], axis=2).max(1)
         # triangles of like size together: within a class the nearest one's centre is among the near centres
@@ -30,7 +35,11 @@ class TriangleDistance:
 
     def __call__(self, points: np.ndarray, limit: float = np.inf) -> np.ndarray:
         """Distance of ``points`` [n,3] m to the nearest triangle [n] m, or ``limit`` [m] where that is less: sooner found."""
-        best = np.full(len(points), float(limit))
+        return self.nearest(points, limit)[1]
+
+    def nearest(self, points: np.ndarray, limit: float = np.inf) -> tuple[np.ndarray, np.ndarray]:
+        """The nearest triangle of ``points`` [n,3] m, or -1 where none is below ``limit`` [m], and the distance as above."""
+        best, which = np.full(len(points), float(limit)), np.full(len(points), -1)
         for members, radius, tree in self._classes:
             reach = best if limit < np.inf else np.minimum(tree.query(points)[0], best)
             near = tree.query_ball_point(points, (reach + radius) * (1 + 1e-9))
@@ -39,12 +48,14 @@ class TriangleDistance:
                 continue
             point = np.repeat(np.arange(len(points)), lengths)
             triangle = members[np.concatenate([found for found in near if found])]
-            height = np.abs(np.einsum("ij,ij->i", points[point] - self._corners[triangle, 0], self._normal[triangle]))
+            height = np.abs(np.einsum("ij,ij->i", points[point] - self.corners[triangle, 0], self.normal[triangle]))
             close = height < best[point]  # most planes are farther away than a nearer triangle
             point, triangle, height = point[close], triangle[close], height[close]
-            found = _pair_distance(points[point], self._corners[triangle], self._normal[triangle], height)
-            np.minimum.at(best, point, found)
-        return best
+            distance = _pair_distance(points[point], self.corners[triangle], self.normal[triangle], height)
+            falling = np.argsort(-distance, kind="stable")
+            falling = falling[distance[falling] < best[point[falling]]]
+            best[point[falling]], which[point[falling]] = distance[falling], triangle[falling]  # the last one written stays
+        return which, best
 
 
 def triangle_distance(corners: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -101,26 +101,27 @@ class PlacementTask:
         """Light sets."""
         return self.radiance.shape[2] // 3
 
-    def in_free_space(self, position: np.ndarray, margin: float = 0.0) -> np.ndarray:
+    def in_free_space(self, position: np.ndarray, margin: float = 0.0, *, seen_by: float = 0.0) -> np.ndarray:
         """True for positions [n,3] m at least ``margin`` m off every surface and in no solid.
 
-        The clearance lattice says so, and one of the nearest points that sees the position: the lattice misses walls that are
-        thinner than its cells.
+        The clearance lattice says so, and the nearest points: one that sees the position, or a share ``seen_by`` of them. The
+        lattice misses walls that are thinner than its cells.
         """
         free: np.ndarray = (self.clearance(torch.as_tensor(position, dtype=torch.float64)) > margin).numpy()
         if free.any():
-            free[free] = self.seen(np.asarray(position, np.float64)[free])
+            free[free] = self.seen(np.asarray(position, np.float64)[free], seen_by)
         return free
 
-    def seen(self, position: np.ndarray) -> np.ndarray:
-        """True for positions [n,3] m that one of the nearest points sees: none in a solid does."""
+    def seen(self, position: np.ndarray, share: float = 0.0) -> np.ndarray:
+        """True for positions [n,3] m that one of the nearest points sees, and this share of them: none in a solid does."""
         points = self.points.numpy()
         witnesses = min(_WITNESSES, len(points))
         near = points[self._tree.query(position, witnesses)[1]].reshape(len(position), witnesses, 3)
         there = np.broadcast_to(position[:, None], near.shape).reshape(-1, 3)
         ends = near.reshape(-1, 3)
         hidden = self.raycaster.blocked_from_either_end(ends, there)
-        return np.asarray(~hidden.reshape(len(position), witnesses).all(1))
+        seeing = (~hidden).reshape(len(position), witnesses).mean(1)
+        return np.asarray((seeing > 0) & (seeing >= share))
 
     @cached_property
     def _tree(self) -> Any:
