@@ -149,8 +149,8 @@ class LpvConfig:
         return self.steps if self.coarsen_after is None else min(self.coarsen_after, self.steps)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values, for ``from_json``."""
-        return asdict(self)
+        """Values as JSON has them, for ``from_json``."""
+        return asdict(self) | {"probes": [list(position) for position in self.probes]}
 
     @classmethod
     def from_json(cls, values: dict[str, Any]) -> LpvConfig:
