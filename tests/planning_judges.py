@@ -2,7 +2,7 @@
 
 from difflpv.bench.configuration import Configuration
 from difflpv.config import LpvConfig
-from difflpv.planning.estimate import Estimate
+from difflpv.error_bounds import Estimate
 
 
 class KnownJudge:

@@ -29,11 +29,11 @@ LAYERS: tuple[tuple[str, tuple[str, ...]], ...] = (
         "values",
         (
             "difflpv.camera_view",
+            "difflpv.error_bounds",
             "difflpv.grid",
             "difflpv.io",
             "difflpv.lights",
             "difflpv.parameters",
-            "difflpv.planning.estimate",  # an error and its bounds, from arrays alone
             "difflpv.raycast",
             "difflpv.scene",
             "difflpv.sh",

@@ -14,9 +14,9 @@ from planning_judges import KnownJudge, rungs_of
 from difflpv.cli import main
 from difflpv.config import LpvConfig, grid_for
 from difflpv.config_file import ConfigFileError, read_config_file
+from difflpv.error_bounds import ErrorSamples
 from difflpv.io import load_scene
 from difflpv.lights import apply_light_set
-from difflpv.planning.estimate import ErrorSamples
 from difflpv.planning.explain import explain
 from difflpv.planning.ladder import PLAN_LADDER, family_of, work_of
 from difflpv.planning.lights import held_out_lights

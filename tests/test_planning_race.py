@@ -11,7 +11,7 @@ from planning_judges import KnownJudge, rungs_of, sizes_of
 
 from difflpv.bench.configuration import Configuration
 from difflpv.config import LpvConfig
-from difflpv.planning.estimate import ErrorSamples
+from difflpv.error_bounds import ErrorSamples
 from difflpv.planning.explain import explain
 from difflpv.planning.ladder import PLAN_LADDER, family_of
 from difflpv.planning.plan import plan_with

@@ -7,9 +7,9 @@ import pytest
 from hand_scenes import panel_scene
 
 from difflpv.config import LpvConfig, grid_for
+from difflpv.error_bounds import ErrorSamples
 from difflpv.illumination import illuminate
 from difflpv.pipeline import Lpv
-from difflpv.planning.estimate import ErrorSamples
 from difflpv.planning.judging import SceneJudge
 from difflpv.planning.ladder import PLAN_LADDER
 from difflpv.planning.lights import held_out_lights

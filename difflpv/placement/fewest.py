@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from difflpv.error_bounds import Estimate
 from difflpv.placement.descent import Descent, Probes
 from difflpv.placement.population import without_least
 from difflpv.placement.segments import Segments
 from difflpv.placement.unseen import Unseen
-from difflpv.planning.estimate import Estimate
 
 __all__ = ["fewest"]
 

@@ -3,7 +3,7 @@
 Error at other points under the lights that placed is too good: positions follow these lights. So every third light set and
 every fifth point are held out. What the probes hold under the lights held out is fitted to the points that placed, as a game
 bakes its own light into probes that stay where they are; the points held out judge. The bound of their error is a quantile of
-a bootstrap over both, points and lights (``difflpv.planning.estimate``).
+a bootstrap over both, points and lights (``difflpv.error_bounds``).
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from difflpv.error_bounds import ErrorSamples, Estimate
 from difflpv.placement.descent import Descent, Probes
 from difflpv.placement.reconstruction import Reconstruction, irradiance_coordinates
 from difflpv.placement.task import PlacementTask
-from difflpv.planning.estimate import ErrorSamples, Estimate
 
 __all__ = ["Unseen"]
 

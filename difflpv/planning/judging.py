@@ -20,12 +20,12 @@ from difflpv.bench.configuration import Configuration
 from difflpv.bench.probes import probe_grid
 from difflpv.blocking import Blocking
 from difflpv.config import LpvConfig, grid_for
+from difflpv.error_bounds import ErrorSamples, Estimate
 from difflpv.evaluate import predict_constant
 from difflpv.grid import Grid
 from difflpv.illumination import Component, Illumination, Receivers, illuminate
 from difflpv.lit_probes import probe_radiance
 from difflpv.pipeline import Lpv
-from difflpv.planning.estimate import ErrorSamples, Estimate
 from difflpv.planning.ladder import work_of
 from difflpv.planning.truth import LEVELS, HeldOutTruth, Level, LevelTruth
 from difflpv.probes.probe_set import COEFFS

@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from difflpv.bench.configuration import Configuration
-from difflpv.planning.estimate import Estimate
+from difflpv.error_bounds import Estimate
 from difflpv.planning.ladder import family_of
 
 __all__ = ["Judge", "Runner", "cheapest", "most_accurate"]
