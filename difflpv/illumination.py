@@ -311,10 +311,13 @@ def illuminate(
         samples, visible = drop_unlit(lit, visibility(lit.position, lit.normal, of_area, raycaster))
     if component == "bounce1" or (blockers == "rsm" and config.occlusion != "none"):
         rsms = tuple(
-            render_rsm(
-                scene, light, raycaster, resolution=rsm_resolution, texel_flux=texel_flux, dtype=dtype, device=device
+            replace(  # by its place: one light may be there twice
+                render_rsm(
+                    scene, light, raycaster, resolution=rsm_resolution, texel_flux=texel_flux, dtype=dtype, device=device
+                ),
+                light_index=place,
             )
-            for light in scene.lights
+            for place, light in enumerate(scene.lights)
             if not isinstance(light, AreaLight)
         )
 

@@ -40,6 +40,14 @@ def test_first_bounce_of_a_point_light_in_a_closed_box_is_albedo_times_its_flux(
     assert light.samples is None and len(light.rsms) == 1
 
 
+def test_one_light_that_stands_there_twice_is_two():
+    """The same value twice in ``Scene.lights``: each has an intensity of its own, in the bounce as in the direct light."""
+    twice = lit(box_scene([LIGHT, LIGHT]), "bounce1", rsm_resolution=8)
+    flux = twice.vpls(LightValues(intensity=torch.tensor([1.0, 3.0], dtype=torch.float64))).flux.sum(0)
+    once = lit(box_scene(), "bounce1", rsm_resolution=8).vpls().flux.sum(0)
+    torch.testing.assert_close(flux, 4 * once)
+
+
 def test_first_bounce_of_an_area_light_in_a_closed_box_is_albedo_times_its_flux():
     """By 8192 surface points and 64 light samples: 1 %."""
     light = lit(closed_room(0.3), "bounce1")
