@@ -91,12 +91,16 @@ class LpvConfig:
         for name, allowed in choices.items():
             if getattr(self, name) not in allowed:
                 raise ValueError(f"{name}: expected one of {', '.join(allowed)}, got {getattr(self, name)!r}")
-        if self.steps < 0:
-            raise ValueError(f"steps: expected a number >= 0, got {self.steps}")
+        for name, least in (("steps", 0), ("coarsen_after", 1), ("l_max", 0)):
+            value = getattr(self, name)
+            optional = value is None and name != "steps"
+            if not optional and (isinstance(value, bool) or not isinstance(value, int) or value < least):
+                raise ValueError(f"{name}: expected an integer >= {least}, got {value!r}")
+        for name in ("clamp", "occlude_first_step"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"{name}: expected true or false, got {getattr(self, name)!r}")
         if not self.tolerance >= 0:
             raise ValueError(f"tolerance: expected a number >= 0, got {self.tolerance}")
-        if self.coarsen_after is not None and self.coarsen_after < 1:
-            raise ValueError(f"coarsen_after: expected at least 1 step, got {self.coarsen_after}")
         self._check_probes()
         if learned:
             object.__setattr__(self, "clamp", False)

@@ -120,16 +120,17 @@ class Parameter:
             Physical values, float64, same shape.
         """
         raw = self._checked("raw", raw)
+        lower, upper = self.lower.to(raw.device), self.upper.to(raw.device)
         if self.map == "interval":
-            width = self.upper - self.lower
+            width = upper - lower
             # Measured from the nearer bound, so that digits are kept next to either of them.
-            below = self.lower + width * torch.sigmoid(raw)
-            above = self.upper - width * torch.sigmoid(-raw)
+            below = lower + width * torch.sigmoid(raw)
+            above = upper - width * torch.sigmoid(-raw)
             return torch.where(raw <= 0, below, above)
         if self.map == "above":
-            return self.lower + self._scale * _softplus(raw)
+            return lower + self._scale * _softplus(raw)
         if self.map == "below":
-            return self.upper - self._scale * _softplus(-raw)
+            return upper - self._scale * _softplus(-raw)
         return self._scale * raw
 
     def to_raw(self, value: Tensor) -> Tensor:

@@ -100,12 +100,13 @@ class Lpv(torch.nn.Module):
     def set_values(self, values: Mapping[str, torch.Tensor]) -> None:
         """Put physical values in place, strictly inside their bounds."""
         for parameter in self.described:
-            getattr(self, f"raw_{parameter.name}").copy_(parameter.to_raw(parameter.nudge_inside(values[parameter.name])))
+            inside = parameter.nudge_inside(values[parameter.name].cpu())
+            getattr(self, f"raw_{parameter.name}").copy_(parameter.to_raw(inside))
 
     def step_factors(self, values: Mapping[str, torch.Tensor] | None = None) -> torch.Tensor:
         """Propagation factor of each step [steps], float64, detached; ``values`` as in ``forward``."""
-        merged = self._merged(values)
-        return (merged["propagation"] * merged["propagation_steps"]).detach().double().cpu()
+        merged = {name: value.detach().cpu().double() for name, value in self._merged(values).items()}
+        return merged["propagation"] * merged["propagation_steps"]
 
     def save(self, folder: str | Path, *, provenance: Mapping[str, Any] | None = None) -> None:
         """Write ``fitted.json`` and ``fitted.safetensors``; ``provenance`` says where the values come from."""

@@ -49,6 +49,12 @@ def test_values_on_their_bounds_are_put_just_inside():
     assert 0 < lpv.values()["propagation"].item() < 1e-5 and 2 > lpv.values()["sampling_bias"].item() > 2 - 1e-5
 
 
+def test_it_moves_to_another_device():
+    """Without a GPU, torch's device without memory tells as well."""
+    lpv = Lpv(GRID, LpvConfig(steps=3), learn=["propagation_steps", "light_color", "albedo"], scene=box_scene())
+    assert {value.device.type for value in lpv.to("meta").values().values()} == {"meta"}
+
+
 def test_no_step_is_the_injected_volume():
     """Without propagation a receiver sees only the VPLs next to it."""
     lpv, light, receivers = solved(LpvConfig(steps=0))
@@ -139,7 +145,7 @@ def test_two_cell_sizes_without_steps_left_are_one():
     assert torch.equal(same(light, receivers), lpv(light, receivers))
     with pytest.raises(ValueError, match="on 1 grid.*this solve needs 'learned_4x6' with 'traced' on 2 or more"):
         Lpv(GRID, LpvConfig(method="learned_4x6", steps=3, coarsen_after=2))(light, receivers)
-    with pytest.raises(ValueError, match="coarsen_after: expected at least 1 step, got 0"):
+    with pytest.raises(ValueError, match="coarsen_after: expected an integer >= 1, got 0"):
         LpvConfig(coarsen_after=0)
     with pytest.raises(ValueError, match="learn: 'cell_propagation' belongs to one grid, coarsen_after=2 makes two"):
         Lpv(GRID, LpvConfig(method="learned_4x6", steps=3, coarsen_after=2), learn=["cell_propagation"])
