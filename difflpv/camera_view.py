@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,7 +22,9 @@ class CameraView:
         hit: index of the pixels (row-major) that see a surface, [m].
         position: [m,3] m.
         normal: unit normals towards the camera, [m,3].
-        albedo: [m,3].
+        albedo: [m,3], textures included: the mesh's factor times ``texture``.
+        texture: value of the albedo texture, 1 where there is none, [m,3].
+        mesh_index: index into ``scene.meshes``, [m].
         emission: radiance of a light's own surface towards the camera [W/(m2 sr)], [m,3].
     """
 
@@ -32,7 +34,13 @@ class CameraView:
     position: np.ndarray
     normal: np.ndarray
     albedo: np.ndarray
+    texture: np.ndarray
+    mesh_index: np.ndarray
     emission: np.ndarray
+
+    def with_albedo(self, factors: np.ndarray) -> CameraView:
+        """The same view of surfaces with another untextured albedo per mesh [M,3], such as a learned one."""
+        return replace(self, albedo=np.asarray(factors)[self.mesh_index] * self.texture)
 
     def image(self, irradiance: np.ndarray, *, emission: bool = True) -> np.ndarray:
         """Radiance image [H,W,3] of irradiance [m,3]: albedo E / pi, plus what lights emit; 0 where nothing is hit."""
@@ -59,6 +67,7 @@ def camera_view(scene: Scene, raycaster: Raycaster, camera: Camera | None = None
     normal = scene.triangle_normals[triangle]
     front = (normal * away).sum(1) < 0
     mesh = scene.triangle_mesh[triangle]
+    texture = scene.texture_at(triangle, hits.barycentric[hit])
     shines = front | scene.mesh_two_sided_emission[mesh]
     return CameraView(
         camera.width,
@@ -66,6 +75,8 @@ def camera_view(scene: Scene, raycaster: Raycaster, camera: Camera | None = None
         hit,
         origins[hit] + hits.distance[hit, None] * away,
         np.where(front[:, None], normal, -normal),
-        scene.albedo_at(triangle, hits.barycentric[hit]),
+        scene.mesh_albedo[mesh] * texture,
+        texture,
+        mesh,
         np.where(shines[:, None], scene.mesh_emission[mesh], 0.0),
     )

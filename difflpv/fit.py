@@ -154,7 +154,7 @@ def fit(
         learn: names from ``difflpv.learnables.LEARNABLES``.
         train: numbers of the light sets to learn from.
         test: numbers of the light sets to judge on; may be empty, must not overlap ``train``.
-        solver: a name of ``difflpv.optim.SOLVERS``.
+        solver: a name of ``difflpv.optim.SOLVERS``; "nnls" makes the squares of the losses of all train lights least.
         loss: "l2" (area-weighted relative), "log", or "image-l1" and "image-ssim" on the camera view; the mean over the
             train lights.
         sparsity: weight of the mean |log f| of per-cell fields f in the loss: cells that gain nothing stay at 1.
@@ -173,8 +173,8 @@ def fit(
 
     Raises:
         FloatingPointError: the solve is not finite where the fit starts, and the propagation factor is not to blame.
-        ValueError: an empty or overlapping split, a light without a target, lights learned on several light sets, or
-            albedo learned from the component "direct".
+        ValueError: an empty or overlapping split, a light without a target, lights learned on several light sets, albedo
+            learned from the component "direct", or a loss that the solver does not know.
     """
     by_index = {t.index: t for t in targets}
     missing = sorted({*train, *test} - set(by_index))
@@ -184,6 +184,8 @@ def fit(
         raise ValueError(f"light sets: train {list(train)} must not be empty and not overlap test {list(test)}")
     if loss not in get_args(Loss):
         raise ValueError(f"loss: expected one of {', '.join(get_args(Loss))}, got {loss!r}")
+    if solver == "nnls" and loss != "l2":
+        raise ValueError(f"loss: solver 'nnls' knows 'l2' alone, got {loss!r}")
     lights = [name for name in learn if name in SCENE_LEARNABLES and name != "albedo"]
     if lights and len(train) + len(test) > 1:
         raise ValueError(f"learn: {', '.join(lights)} belong to one light set: train on one and test on none")
@@ -206,10 +208,11 @@ def fit(
                 return sum((v.sum() for v in values.values()), torch.zeros((), dtype=torch.float64)) * torch.nan
 
         def residual(values: dict[str, torch.Tensor]) -> torch.Tensor:
-            parts = [
-                (t.weight.sqrt()[:, None] * (lpv(t.illumination, t.receivers, values) - t.irradiance)).double().ravel()
-                for t in learned_on
-            ]
+            parts = []
+            for t in learned_on:  # relative, as the loss is: or a bright light set would count more than a dim one
+                root = t.weight.sqrt()[:, None]
+                gap = root * (lpv(t.illumination, t.receivers, values) - t.irradiance)
+                parts.append((gap / torch.linalg.vector_norm(root * t.irradiance)).double().ravel())
             return torch.cat(parts)
 
         return Problem(objective, lpv.described, backward_cost=_BACKWARD_COST, residual=residual, label=label)
@@ -287,15 +290,17 @@ def _image_loss(loss: str, targets: Sequence[LightTarget]) -> Measure:
         shown[pixels] = dark
         truth = t.image * shown.view(view.height, view.width, 1)
         receivers = t.illumination.receivers(view.position, view.normal)
-        reflect = torch.as_tensor(view.albedo, dtype=t.image.dtype, device=t.image.device) * dark[:, None] / np.pi
-        views.append((view, receivers, reflect, truth))
+        texture = torch.as_tensor(view.texture, dtype=t.image.dtype, device=t.image.device) * dark[:, None]
+        views.append((view, receivers, texture, truth))
 
     def measure(lpv: Lpv, values: dict[str, torch.Tensor]) -> torch.Tensor:
         parts = []
-        for t, (view, receivers, reflect, truth) in zip(targets, views, strict=True):
+        for t, (view, receivers, texture, truth) in zip(targets, views, strict=True):
             irradiance = lpv(t.illumination, receivers, values)
+            factors = values.get("albedo", torch.as_tensor(t.illumination.scene.mesh_albedo)).to(truth)
+            radiance = factors[torch.as_tensor(view.mesh_index, device=truth.device)] * texture * irradiance / np.pi
             pixels = torch.zeros(view.height * view.width, 3, dtype=truth.dtype, device=truth.device)
-            image = pixels.index_put((torch.as_tensor(view.hit, device=truth.device),), reflect * irradiance)
+            image = pixels.index_put((torch.as_tensor(view.hit, device=truth.device),), radiance)
             image = image.view(view.height, view.width, 3)
             parts.append(image_l1(image, truth) if loss == "image-l1" else image_ssim(image, truth))
         return torch.stack(parts).mean().double()

@@ -303,17 +303,21 @@ class Scene:
         return np.array([m.material.albedo for m in self.meshes])
 
     def albedo_at(self, triangle: np.ndarray, barycentric: np.ndarray) -> np.ndarray:
-        """Albedo at surface points, textures looked up by UV.
+        """Albedo at surface points, shape [n,3]: the mesh's factor times the texture (``texture_at``)."""
+        return self.mesh_albedo[self.triangle_mesh[triangle]] * self.texture_at(triangle, barycentric)
+
+    def texture_at(self, triangle: np.ndarray, barycentric: np.ndarray) -> np.ndarray:
+        """Value of the albedo texture at surface points, looked up by UV.
 
         Args:
             triangle: triangle index in mesh order, shape [n].
             barycentric: weights (u, v) of the second and third corner, shape [n,2].
 
         Returns:
-            Albedo, shape [n,3].
+            Shape [n,3]; 1 where there is no texture.
         """
         mesh_index = self.triangle_mesh[triangle]
-        albedo = self.mesh_albedo[mesh_index]
+        value = np.ones((len(mesh_index), 3))
         first = np.concatenate([[0], np.cumsum([len(m.triangles) for m in self.meshes])])
         for k, mesh in enumerate(self.meshes):
             if mesh.material.texture is None or mesh.uv is None:
@@ -323,8 +327,8 @@ class Scene:
                 corners = mesh.uv[mesh.triangles[triangle[here] - first[k]]]
                 u, v = barycentric[here, 0, None], barycentric[here, 1, None]
                 uv = (1 - u - v) * corners[:, 0] + u * corners[:, 1] + v * corners[:, 2]
-                albedo[here] *= mesh.material.texture.lookup(uv)
-        return albedo
+                value[here] = mesh.material.texture.lookup(uv)
+        return value
 
     def with_lights(self, lights: Sequence[Light], moved: dict[str, Mesh] | None = None) -> Scene:
         """The same scene under other lights; ``moved`` replaces meshes by name (an area light's panel)."""

@@ -102,6 +102,8 @@ def simulate(
 def render(lpv: Lpv, light: Illumination, camera: Camera | None = None) -> tuple[np.ndarray, tuple[str, ...]]:
     """Image from a camera: radiance albedo E / pi [H,W,3], lights showing their own in component "direct".
 
+    A learned albedo is that of the surfaces seen too.
+
     Raises:
         SceneError: the scene has no camera.
         FloatingPointError: the result is not finite.
@@ -109,5 +111,7 @@ def render(lpv: Lpv, light: Illumination, camera: Camera | None = None) -> tuple
     view = camera_view(light.scene, light.raycaster, camera)
     if not len(view.hit):
         return view.image(np.zeros((0, 3))), ("the camera sees no surface",)
+    if "albedo" in lpv.learned:
+        view = view.with_albedo(lpv.values()["albedo"].detach().cpu().numpy())
     prediction = solve_irradiance(lpv, light, view.position, view.normal)
     return view.image(prediction.irradiance, emission=light.component == "direct"), prediction.warnings

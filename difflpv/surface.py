@@ -75,10 +75,7 @@ def albedo_by_mesh(
 
 def texture_at(scene: Scene, triangle: np.ndarray, barycentric: np.ndarray) -> np.ndarray:
     """Value of the albedo texture [n,3] (1 where there is none) at ``triangle`` [n] with ``barycentric`` [n,2]."""
-    if not any(mesh.material.texture is not None for mesh in scene.meshes):
-        return np.ones((len(triangle), 3))
-    white = [replace(mesh, material=replace(mesh.material, albedo=np.ones(3))) for mesh in scene.meshes]
-    return replace(scene, meshes=tuple(white)).albedo_at(triangle, barycentric)
+    return scene.texture_at(triangle, barycentric)
 
 
 def sample_surfaces(

@@ -2,11 +2,11 @@ import dataclasses
 
 import numpy as np
 import pytest
-from hand_scenes import panel_scene
+from hand_scenes import LIGHT, panel_scene, rectangle
 
 from difflpv.camera_view import camera_view
 from difflpv.raycast import Raycaster
-from difflpv.scene import Camera, SceneError
+from difflpv.scene import Camera, Scene, SceneError, Texture
 
 # Looks down from y = 4 on the floor at y = 0 (4 x 4 m): +x to the right, -z up in the image.
 DOWN = np.array([[1.0, 0, 0, 0], [0, 0, 1, 4], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -35,6 +35,13 @@ def test_image_is_radiance_and_zero_where_nothing_is():
     assert not image[0].any() and not image[:, 0].any()
     seen = image.reshape(-1, 3)[view.hit]
     np.testing.assert_allclose(seen, view.albedo)
+
+
+def test_another_albedo_keeps_the_texture():
+    texture = Texture(np.linspace(0.1, 0.9, 36).reshape(4, 3, 3).astype(np.float32))
+    floor = rectangle("floor", (-2, 0, -2), (0, 0, 4), (4, 0, 0), (0.5, 0.5, 0.5), uv=True, texture=texture)
+    view = view_of(Scene("textured", (floor,), (LIGHT,)))
+    np.testing.assert_allclose(view.with_albedo(np.array([[0.5, 0.25, 1.0]])).albedo, view.albedo * [1, 0.5, 2], rtol=1e-12)
 
 
 @pytest.mark.parametrize(("two_sided", "from_below"), [(False, False), (True, False), (False, True)])

@@ -210,6 +210,7 @@ BAD = {
     "unseen field": (["--learn", "albedo", "--unseen", "cornell=x"], "--unseen: albedo can not be carried"),
     "constant": (["--method", "constant"], "argument --method: invalid choice: 'constant'"),
     "component": (["--component", "full"], "argument --component: invalid choice: 'full'"),
+    "nnls loss": (["--solver", "nnls", "--loss", "log"], "loss: solver 'nnls' knows 'l2' alone, got 'log'"),
     "nnls": (["--solver", "nnls", "--budget", "3"], "budget: expected at least 4 forward-equivalents for nnls"),
 }
 

@@ -1,6 +1,7 @@
 """Fits on a box whose truth is known because the solve itself made it."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from difflpv.config import LpvConfig
 from difflpv.fit import fit, light_target, score_lights
 from difflpv.grid import Grid
 from difflpv.illumination import illuminate
+from difflpv.loss import relative_l2
 from difflpv.optim.result import Status
 from difflpv.pipeline import Lpv
 from difflpv.scene import AreaLight, Camera, Scene
@@ -114,12 +116,53 @@ def test_light_intensities_by_least_squares(component):
     np.testing.assert_allclose(outcome.result.parameters["light_intensity"], truth["light_intensity"], rtol=1e-6)
 
 
+def test_least_squares_of_several_lights_is_relative():
+    """A light set a hundred times as bright pulls no more than the other: the sum of squared losses is least."""
+    config = LpvConfig(method="learned_4x6", steps=3)
+    scene, targets = targets_of(config, {"lookup_gains": [0.9, 0.6]}, count=2)
+    dim = replace(targets[1], irradiance=1.3 * targets[1].irradiance)
+    bright = light_target(
+        scene, [entry | {"radiance": [100 * v for v in entry["radiance"]]} for entry in light_sets(1)[0]], GRID, config,
+        "bounce1", index=0, position=POSITION, normal=NORMAL, irradiance=100 * targets[0].irradiance.numpy(), weight=WEIGHT,
+        dtype=torch.float64, **FEW,
+    )  # fmt: skip
+    lights = [bright, dim]
+    outcome = fit(scene, lights, config=config, learn=["lookup_gains"], train=[0, 1], test=[], solver="nnls", budget=6)
+    assert outcome.result.status is Status.CONVERGED
+    gains = outcome.result.parameters["lookup_gains"].clone().requires_grad_(True)
+    losses = [
+        relative_l2(outcome.lpv(t.illumination, t.receivers, {"lookup_gains": gains}), t.irradiance, t.weight) for t in lights
+    ]
+    (slope,) = torch.autograd.grad(sum(loss.square() for loss in losses), gains)
+    assert all(float(loss.detach()) > 0.01 for loss in losses) and float(slope.norm()) < 1e-9
+
+
+def test_least_squares_knows_no_other_loss():
+    scene, targets = targets_of(CONFIG, {"propagation": 0.8})
+    with pytest.raises(ValueError, match="loss: solver 'nnls' knows 'l2' alone, got 'log'"):
+        fit(scene, targets, config=CONFIG, learn=["light_intensity"], train=[0], test=[], solver="nnls", loss="log", budget=9)
+
+
 def test_least_squares_refuses_what_is_not_linear():
     """Opposite lobes meet in the clamp of one cell: max(0, a + b) is not max(0, a) + max(0, b)."""
     config = LpvConfig(method="lpv", steps=6)
     scene, targets = targets_of(config, {"light_intensity": [1.7, 0.4]}, component="direct", upward=True)
     outcome = fit(scene, targets, config=config, learn=["light_intensity"], train=[0], test=[], solver="nnls", budget=5)
     assert outcome.result.status is Status.FAILED and "not affine" in outcome.result.message
+
+
+def test_an_image_shows_the_albedo_that_is_learned():
+    """The surface that a pixel sees reflects by the albedo being fitted, as those do that light it."""
+    wanted = np.linspace(0.3, 0.7, 24).reshape(8, 3)
+    scene, targets = targets_of(LpvConfig(steps=3), {"albedo": wanted}, image=True)
+    outcome = fit(
+        scene, targets, config=LpvConfig(steps=3), learn=["albedo"], train=[0], test=[], loss="image-l1", budget=3,
+        initial={"albedo": wanted},
+    )  # fmt: skip
+    assert outcome.result.history[0].loss < 1e-5
+    painted = [replace(m, material=replace(m.material, albedo=a)) for m, a in zip(scene.meshes, wanted, strict=True)]
+    lit = illuminate(replace(scene, meshes=tuple(painted)), GRID, LpvConfig(steps=3), dtype=torch.float64, **FEW)
+    np.testing.assert_allclose(targets[0].image, render(Lpv(GRID, LpvConfig(steps=3)), lit)[0], rtol=1e-4, atol=1e-12)
 
 
 @pytest.mark.parametrize("loss", ["image-l1", "image-ssim"])
