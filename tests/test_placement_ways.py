@@ -46,6 +46,13 @@ def test_every_way_gives_free_distinct_positions_at_most_as_many_as_asked_for(me
     assert all(math.isnan(error) or error > 0 for _, error, _ in told)
 
 
+@pytest.mark.parametrize("method", PLACEMENT_METHODS)
+def test_points_without_light_are_refused(method):
+    dark = analytic_task(points=20, radiance=lambda x: np.zeros((*x.shape[:-1], 9, 3)))
+    with pytest.raises(ValueError, match=f"{method}: expected light at the task's points, got none"):
+        place(dark, 4, method)
+
+
 @pytest.mark.parametrize("method", ["sbplx", "crs2", "bobyqa", "cma"])
 def test_a_solver_keeps_its_budget_and_never_ends_above_its_start(method, task):
     if method == "cma":

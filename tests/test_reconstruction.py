@@ -3,7 +3,7 @@ import pytest
 import torch
 from placement_tasks import HIGH, LOW, analytic_task
 
-from difflpv.placement.reconstruction import fitted_content, reconstruction_error
+from difflpv.placement.reconstruction import fitted_content, reconstruction_error, relative_error
 from difflpv.probes.tetrahedra import TetrahedralInterpolation
 
 
@@ -31,6 +31,23 @@ def test_error_has_the_gradient_of_its_differences(content) -> None:
     assert torch.autograd.gradcheck(
         lambda p: reconstruction_error(task, p, content=content, interpolation=connectivity), (probes,), atol=1e-6
     )
+
+
+def test_where_all_is_met_exactly_the_slope_is_none_and_not_nan() -> None:
+    """Points at the only probe, in light that is the same everywhere."""
+    even = analytic_task(points=3, radiance=lambda x: np.ones((*x.shape[:-1], 9, 3)))
+    probe = torch.tensor(even.field.grid.cell_centers()[8, 8, 8][None]).requires_grad_(True)
+    error = reconstruction_error(even, probe)
+    error.backward()
+    assert error.item() < 1e-100 and probe.grad is not None and not probe.grad.any()
+
+
+def test_points_without_light_are_named() -> None:
+    dark = analytic_task(points=20, radiance=lambda x: np.zeros((*x.shape[:-1], 9, 3)))
+    with pytest.raises(ValueError, match="placement radiance: expected light at a point of some weight, got none"):
+        reconstruction_error(dark, some_probes(4))
+    with pytest.raises(ValueError, match="placement radiance: expected light at a point of some weight, got none"):
+        relative_error(dark, dark.radiance)
 
 
 def test_an_unknown_content_is_named() -> None:

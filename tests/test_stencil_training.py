@@ -61,6 +61,15 @@ def test_octant_is_the_full_grid():
     torch.testing.assert_close(octant[-1], full[:, :, 4:, 4:, 4:].movedim(1, -1), rtol=1e-12, atol=1e-14)
 
 
+def test_a_second_derivative_of_responses_is_refused():
+    """It was wrong: the volumes between the steps are kept as numbers."""
+    matrices = torch.tensor(np.array(equivariant_basis(1, 6)[3])).requires_grad_(True)
+    squares = octant_responses(matrices, neighbors=6, l_max=1, size=3, stops=(2,)).square().sum()
+    (gradient,) = torch.autograd.grad(squares, matrices, create_graph=True)
+    with pytest.raises(RuntimeError, match="differentiate twice|not have been used"):
+        torch.autograd.grad(gradient.sum(), matrices)
+
+
 @pytest.mark.parametrize("rung", [(1, 6), (2, 26), (3, 26)])
 def test_gradient_by_finite_differences(rung):
     l_max, neighbors = rung

@@ -19,7 +19,7 @@ import torch
 from difflpv.placement.descent import Descent, Probes
 from difflpv.placement.fewest import fewest
 from difflpv.placement.free_moves import FreeMoves, Region
-from difflpv.placement.journal import Journal
+from difflpv.placement.journal import Journal, distinct
 from difflpv.placement.penalties import Penalties
 from difflpv.placement.population import with_spawned, without_least
 from difflpv.placement.reconstruction import Content, Reconstruction
@@ -139,10 +139,11 @@ def place_gradient(
             raise
         details["interrupted"] = True
     assert segments.best is not None
+    best = segments.best.kept(distinct(segments.best.position, 0.0))  # a region's corner may have caught several
     descent = replace(descent_on(task), reconstruction=Reconstruction(task, content, ridge=ridge))
-    details["training_error"] = descent.error(segments.best)
-    radiance = None if content == "field" else descent.content(segments.best)
-    return journal.placement(segments.best.position, radiance=radiance, reader=descent.settled(segments.best), **details)
+    details["training_error"] = descent.error(best)
+    radiance = None if content == "field" else descent.content(best)
+    return journal.placement(best.position, radiance=radiance, reader=descent.settled(best), **details)
 
 
 @dataclass(frozen=True)

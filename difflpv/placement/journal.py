@@ -30,10 +30,12 @@ class Journal:
         """Start the clock.
 
         Raises:
-            ValueError: ``count`` is not a positive number of probes.
+            ValueError: ``count`` is not a positive number of probes, or no light comes to the task's points.
         """
         if count < 1:
             raise ValueError(f"{method}: expected at least 1 probe, got {count}")
+        if not task.radiance.any():
+            raise ValueError(f"{method}: expected light at the task's points, got none")
         self.task = task
         self.evaluations = 0
         self.seconds_before = 0.0

@@ -79,7 +79,7 @@ def with_spawned(descent: Descent, probes: Probes, count: int) -> Probes:
     reach = 0.5 * float((np.prod(high - low) / (len(probes) + count)) ** (1 / 3))
     near = KDTree(points).query_ball_point(points, reach)
     around = np.array([energy[group].sum() for group in near])
-    around[~descent.moves.allowed(points)] = -1.0
+    around[~descent.moves.allowed(points) | (KDTree(probes.position).query(points)[0] == 0)] = -1.0
     chosen: list[int] = []
     while len(chosen) < count and around.max() >= 0:
         chosen.append(int(around.argmax()))

@@ -17,6 +17,7 @@ __all__ = ["Content", "Reconstruction", "fitted_content", "irradiance_coordinate
 
 Content = Literal["field", "fitted"]
 _RIDGE = 0.02
+_DARK = "placement radiance: expected light at a point of some weight, got none"
 _LOBES = cosine_lobe(DIRECTIONS_26, 2)
 _FACTOR = torch.from_numpy(np.linalg.cholesky(_LOBES.T @ _LOBES))
 
@@ -59,7 +60,7 @@ class Reconstruction:
         """Take the truth.
 
         Raises:
-            ValueError: an unknown content, a negative ridge, or a share that is none.
+            ValueError: an unknown content, a negative ridge, a share that is none, or points without light.
         """
         if not 0 < kept <= 1:
             raise ValueError(f"kept: expected a share in (0, 1], got {kept}")
@@ -71,6 +72,8 @@ class Reconstruction:
         self.ridge = ridge
         self.truth = irradiance_coordinates(task.radiance).flatten(1)
         self._scale = float((task.weights[:, None] * self.truth.square()).sum().sqrt())
+        if not self._scale > 0:
+            raise ValueError(_DARK)
         self._axes: torch.Tensor | None = None
         if kept < 1:
             energy, axes = torch.linalg.eigh(self.truth.T @ (self.truth * task.weights[:, None]))
@@ -91,14 +94,22 @@ class Reconstruction:
     def error(self, position: torch.Tensor, rows: Rows) -> torch.Tensor:
         """Relative L2 error of irradiance over 26 normals at the task's points, a scalar."""
         square = (self.read(position, rows)[1] - self.truth).square().sum(1)
-        return (self.task.weights * square).sum().sqrt() / self._scale
+        # the root has no slope at 0, where all is met exactly: the bound's is 0
+        return (self.task.weights * square).sum().clamp_min(torch.finfo(square.dtype).tiny).sqrt() / self._scale
 
 
 def relative_error(task: PlacementTask, radiance: torch.Tensor) -> torch.Tensor:
-    """Relative L2 error of irradiance over 26 normals, a scalar, of ``radiance`` [m,9,C] W/m2 at the task's points."""
+    """Relative L2 error of irradiance over 26 normals, a scalar, of ``radiance`` [m,9,C] W/m2 at the task's points.
+
+    Raises:
+        ValueError: points without light.
+    """
     weight = task.weights[:, None, None]
     found, truth = irradiance_coordinates(radiance), irradiance_coordinates(task.radiance)
-    return ((weight * (found - truth).square()).sum() / (weight * truth.square()).sum()).sqrt()
+    power = (weight * truth.square()).sum()
+    if not power > 0:
+        raise ValueError(_DARK)
+    return ((weight * (found - truth).square()).sum() / power).sqrt()
 
 
 def reconstruction_error(
@@ -119,7 +130,7 @@ def reconstruction_error(
         ridge: of ``fitted_content``.
 
     Raises:
-        ValueError: an unknown content.
+        ValueError: an unknown content, or points without light.
     """
     reader = interpolation or TetrahedralInterpolation(position.detach())
     return Reconstruction(task, content, ridge=ridge).error(position, reader.rows(position, task.points))

@@ -8,14 +8,14 @@ a bootstrap over both, points and lights (``difflpv.error_bounds``).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from difflpv.error_bounds import ErrorSamples, Estimate
 from difflpv.placement.descent import Descent, Probes
-from difflpv.placement.reconstruction import Reconstruction, irradiance_coordinates
+from difflpv.placement.reconstruction import fitted_content, irradiance_coordinates
 from difflpv.placement.task import PlacementTask
 
 __all__ = ["Unseen"]
@@ -70,14 +70,13 @@ class Unseen:
             probes: which.
             confidence: of each bound, in [0.5, 1).
         """
-        ridge, content = descent.reconstruction.ridge, descent.reconstruction.content
         position = torch.tensor(probes.position)
-        if content == "fitted":
-            fitted = replace(descent, reconstruction=Reconstruction(self.fit, content, ridge=ridge))
-            held = torch.as_tensor(fitted.content(probes))
+        reader = descent.settled(probes).over(probes.position, self.judge.scene, raycaster=descent.task.raycaster)
+        if descent.reconstruction.content == "fitted":
+            rows = reader.rows(position, self.fit.points)
+            held = fitted_content(self.fit, position, rows, ridge=descent.reconstruction.ridge)
         else:
             held = self.judge.field(position)
-        reader = descent.settled(probes).over(probes.position, self.judge.scene, raycaster=descent.task.raycaster)
         found = reader.rows(position, self.judge.points).apply(irradiance_coordinates(held))
         truth = irradiance_coordinates(self.judge.radiance)
         squared, power = (_by_light(self.judge, part) for part in (found - truth, truth))

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch.autograd.function import once_differentiable
 
 from difflpv.convolution import stencil_weight
 from difflpv.sh import coeff_count
@@ -130,6 +131,7 @@ class _Responses(torch.autograd.Function):
         return torch.stack(results)
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, bar: torch.Tensor) -> tuple[Any, ...]:
         (matrices,) = ctx.saved_tensors
         offsets, l_max, size, stops = ctx.setup
