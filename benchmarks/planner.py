@@ -3,9 +3,10 @@
     python benchmarks/planner.py [--scenes NAME ...] [--tolerances 0.1 0.2 0.4] [--folder out/planner] [--out docs/planner.md]
 
 The sweep judges every rung of the ladder on all receivers, paths and lights of the last level, sharing set-up among rungs as
-the planner does; the planner starts anew for every tolerance, tracing its own truth. Both are timed by the processor time of
-this process (one thread), after kernels have been loaded: other work on the machine hardly counts. A scene whose results lie
-in ``--folder`` is not run again.
+the planner does, and times each by the function that the planner uses (``difflpv.planning.timing``); those whose times leave
+open which is the cheapest are then timed anew in turns, as by the planner. The planner starts anew for every tolerance, tracing
+its own truth. Both are timed by the processor time of this process (one thread), after kernels have been loaded. A scene whose
+results lie in ``--folder`` is not run again.
 """
 
 from __future__ import annotations
@@ -27,9 +28,10 @@ from difflpv.planning.judging import SceneJudge
 from difflpv.planning.ladder import PLAN_LADDER
 from difflpv.planning.lights import held_out_lights
 from difflpv.planning.plan import make_plan
+from difflpv.planning.timing import TIE, cheapest_of, time_rivals
 from difflpv.planning.truth import LEVELS, Level
 
-_TIE = 1.1
+_NEAR = 1.1  # times the cost of the sweep's choice
 _MOVING = (10_000, 1_000_000)
 _WANTED = 0.25  # of the sweep's time
 
@@ -44,20 +46,33 @@ def load_kernels() -> None:
                 judge.judge(rung, 0)
 
 
-def sweep(name: str) -> dict[str, Any]:
-    """Every rung on the last level: name -> error, bounds, seconds; processor time of the truth, and of all."""
-    scene, component = load_scene(name), BUNDLED[name][0]
-    begin = time.process_time()
+def sweep(name: str, tolerances: list[float]) -> dict[str, Any]:
+    """Every rung on the last level, and what is chosen for each tolerance.
+
+    Returns:
+        rungs: name -> error, bounds, seconds.
+        choices: tolerance -> "chosen" and the "seconds" of those that were timed in turns.
+        truth, timing, seconds: processor time of the truth, of timing every rung, and of all.
+    """
+    scene, component, last = load_scene(name), BUNDLED[name][0], len(LEVELS) - 1
+    begin, by_name = time.process_time(), {rung.name: rung for rung in PLAN_LADDER}
     with tempfile.TemporaryDirectory() as folder:
         judge = SceneJudge(scene, component, held_out_lights(scene, LEVELS[-1].lights), folder)
-        judge.truth.level(len(LEVELS) - 1)
-        rungs, truth = {}, time.process_time() - begin
+        judge.truth.level(last)
+        rungs, choices, truth, timing = {}, {}, time.process_time() - begin, 0.0
         for rung in PLAN_LADDER:
-            estimate, _ = judge.judge(rung, len(LEVELS) - 1)
-            seconds = judge.retime(rung)
+            estimate, rough = judge.judge(rung, last)
+            started = time.process_time()
+            seconds = time_rivals({rung: rough}, judge.solve_of).get(rung, 0.0)
+            timing += time.process_time() - started
             rungs[rung.name] = {**estimate.to_json(), "seconds": seconds, "work": judge.work(rung)}
             print(f"{name}: {rung.name}: {estimate.error:.3f} to {estimate.high:.3f}, {1e3 * seconds:.2f} ms", flush=True)
-    return {"rungs": rungs, "truth": truth, "seconds": time.process_time() - begin}
+        for tolerance in tolerances:
+            meeting = {n: r["seconds"] for n, r in rungs.items() if r["high"] <= tolerance}
+            timed = time_rivals(meeting, lambda n: judge.solve_of(by_name[n]))
+            chosen = cheapest_of({**meeting, **timed}, {n: rungs[n]["work"] for n in meeting}) if meeting else None
+            choices[f"{tolerance:g}"] = {"chosen": chosen, "seconds": timed}
+    return {"rungs": rungs, "choices": choices, "truth": truth, "timing": timing, "seconds": time.process_time() - begin}
 
 
 def plan(name: str, tolerance: float, moving: int = 0) -> dict[str, Any]:
@@ -76,38 +91,31 @@ def plan(name: str, tolerance: float, moving: int = 0) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def brute_choice(rungs: dict[str, Any], tolerance: float) -> str | None:
-    """The cheapest rung surely within the tolerance; of costs within a tie that of least work."""
-    meeting = {name: r for name, r in rungs.items() if r["high"] <= tolerance}
-    if not meeting:
-        return None
-    least = min(r["seconds"] for r in meeting.values())
-    tied = [name for name, r in meeting.items() if r["seconds"] <= _TIE * least]
-    return min(tied, key=lambda name: meeting[name]["work"])
-
-
-def cost_ratio(rungs: dict[str, Any], ours: str | None, theirs: str | None) -> float:
+def cost_ratio(seconds: dict[str, float], ours: str | None, theirs: str | None) -> float:
     """Cost of the planner's answer over that of the sweep's; infinite where only one of them found any."""
     if ours == theirs:
         return 1.0
     if ours is None or theirs is None:
         return float("inf")
-    return rungs[ours]["seconds"] / max(rungs[theirs]["seconds"], 1e-9)
+    return seconds[ours] / max(seconds[theirs], 1e-9)
 
 
 def page(results: dict[str, Any], tolerances: list[float], command: str) -> str:
     """The document."""
-    rows, shares, ratios = [], {}, []
+    rows, shares, untimed, ratios = [], {}, [], []
     for name, result in results.items():
         rungs = result["sweep"]["rungs"]
         for tolerance in tolerances:
             p = result["plans"][f"{tolerance:g}"]
-            theirs = brute_choice(rungs, tolerance)
+            theirs, timed = (result["sweep"]["choices"][f"{tolerance:g}"][key] for key in ("chosen", "seconds"))
+            seconds = {n: timed.get(n, r["seconds"]) for n, r in rungs.items()}
             share = p["seconds"] / result["sweep"]["seconds"]
             shares[f"{name} at {tolerance:g}"] = share
-            ratios.append(cost_ratio(rungs, p["chosen"], theirs))
+            untimed.append(p["seconds"] / (result["sweep"]["seconds"] - result["sweep"]["timing"]))
+            ratios.append(cost_ratio(seconds, p["chosen"], theirs))
             cells = [
-                f"{name} {BUNDLED[name][0]}", f"{tolerance:g}", _shown(p["chosen"], rungs), _shown(theirs, rungs),
+                f"{name} {BUNDLED[name][0]}", f"{tolerance:g}", _shown(p["chosen"], rungs, seconds),
+                _shown(theirs, rungs, seconds),
                 "same" if p["chosen"] == theirs else f"{ratios[-1]:.2f} x its cost", f"{p['judged']} of {len(rungs)}",
                 f"{p['seconds']:.1f} of {result['sweep']['seconds']:.1f} ({share:.2f})",
             ]  # fmt: skip
@@ -115,7 +123,7 @@ def page(results: dict[str, Any], tolerances: list[float], command: str) -> str:
     levels = "; ".join(
         f"{v.receivers} receivers, {v.spp} paths for those that are new, {v.lights} light{'s' * (v.lights > 1)}" for v in LEVELS
     )
-    mean, near = sum(shares.values()) / len(shares), sum(ratio <= _TIE for ratio in ratios)
+    mean, near = sum(shares.values()) / len(shares), sum(ratio <= _NEAR for ratio in ratios)
     over = {pair: share for pair, share in shares.items() if share > _WANTED}
     listed = ", ".join(f"{pair} ({share:.2f})" for pair, share in sorted(over.items(), key=lambda one: -one[1]))
     lines = [
@@ -126,7 +134,8 @@ def page(results: dict[str, Any], tolerances: list[float], command: str) -> str:
         "level, with the same truth and sharing set-up among rungs as the planner does.", "",
         f"Levels, each adding to the one before: {levels}. Lights: of cornell and two_rooms_90 four of the bundled sets, "
         "elsewhere the scene's own and three moved or turned ones. Costs: processor time of one solve (inject, propagate), one "
-        "thread, the least of several.", "",
+        "thread; where a choice hangs on it, the geometric mean of up to 25 taken in turns with whatever else may be "
+        f"the cheapest. Costs within {100 * (TIE - 1):g} % are one: then the least work is taken.", "",
         "| scene | tolerance | planner: rung, error, ms | sweep: rung, error, ms | planner against sweep | judged | time [s] |",
         "|---|---|---|---|---|---|---|", *rows, "",
         f"Wanted: the sweep's answer, or one within 10 % of its cost. Reached in {near} of {len(ratios)} cases.", "",
@@ -135,7 +144,9 @@ def page(results: dict[str, Any], tolerances: list[float], command: str) -> str:
         + (f"; over it: {listed}" if over else "")
         + ". A sweep serves all tolerances at once, a plan one. Dear are tolerances near what the best rungs reach: then many "
         "are judged under all lights, and on the last level, whose truth alone takes "
-        f"{_share_of_truth(results)} of a sweep's time.", "",
+        f"{_share(results, 'truth')} of a sweep's time. Timing every rung by itself takes {_share(results, 'timing')} of it: "
+        f"of a sweep that did without, a plan takes {min(untimed):.2f} to {max(untimed):.2f}, "
+        f"{sum(untimed) / len(untimed):.2f} on average.", "",
         *_moving_table(results, max(tolerances)),
         "## In the planner's words", "",
         "Errors are those of the last level on which a rung was judged: what is rejected early is known roughly, and under "
@@ -144,10 +155,10 @@ def page(results: dict[str, Any], tolerances: list[float], command: str) -> str:
     for name, result in results.items():
         lines += [f"### {name}, {BUNDLED[name][0]}", ""]
         for tolerance in tolerances[1:2] if name == "cornell" else ():
-            lines += [result["plans"][f"{tolerance:g}"]["words"].replace("\nleft out,", "\n\nleft out,"), ""]
+            lines += [result["plans"][f"{tolerance:g}"]["words"], ""]
         for tolerance in tolerances:
-            words = result["plans"][f"{tolerance:g}"]["words"].split("\n\n")
-            lines += [f"- {words[0]}. {words[-1] if len(words) > 1 else ''}".rstrip()]
+            words = [" ".join(part.split()) for part in result["plans"][f"{tolerance:g}"]["words"].split("\n\n")]
+            lines += [f"- {words[0]}. {words[-1] + '.' if len(words) > 1 else ''}".rstrip()]
         lines.append("")
     return "\n".join(lines)
 
@@ -177,15 +188,15 @@ def _key(tolerance: float, moving: int = 0) -> str:
     return f"{tolerance:g}" + (f", {moving} moving" if moving else "")
 
 
-def _share_of_truth(results: dict[str, Any]) -> str:
-    shares = [result["sweep"]["truth"] / result["sweep"]["seconds"] for result in results.values()]
+def _share(results: dict[str, Any], part: str) -> str:
+    shares = [result["sweep"][part] / result["sweep"]["seconds"] for result in results.values()]
     return f"{min(shares):.2f} to {max(shares):.2f}"
 
 
-def _shown(name: str | None, rungs: dict[str, Any]) -> str:
+def _shown(name: str | None, rungs: dict[str, Any], seconds: dict[str, float]) -> str:
     if name is None:
         return "none meets it"
-    return f"{name}; {rungs[name]['error']:.3f}; {1e3 * rungs[name]['seconds']:.1f}"
+    return f"{name}; {rungs[name]['error']:.3f}; {1e3 * seconds[name]:.1f}"
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -207,8 +218,8 @@ def main(argv: list[str] | None = None) -> None:
             if _key(tolerance, moving) not in result["plans"]:
                 result["plans"][_key(tolerance, moving)] = plan(name, tolerance, moving)
                 write_json(kept, result)
-        if "sweep" not in result:
-            result["sweep"] = sweep(name)
+        if not {f"{tolerance:g}" for tolerance in args.tolerances} <= set(result.get("sweep", {}).get("choices", ())):
+            result["sweep"] = sweep(name, args.tolerances)
             write_json(kept, result)
         results[name] = result
     text = page(results, args.tolerances, "python benchmarks/planner.py --out docs/planner.md")

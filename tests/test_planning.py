@@ -42,7 +42,7 @@ def test_what_is_chosen_meets_the_tolerance_and_nothing_cheaper_does(known, tole
         return
     chosen = plan.chosen.rung.name
     assert errors[chosen] <= tolerance
-    assert seconds[chosen] <= 1.1 * min(seconds[name] for name in meeting) * (1 + 1e-9)  # costs within a tie are one
+    assert seconds[chosen] <= 1.05 * min(seconds[name] for name in meeting) * (1 + 1e-9)  # costs within a tie are one
 
 
 @settings(max_examples=150, deadline=None)
@@ -73,8 +73,9 @@ def test_only_what_is_near_the_answer_is_judged_closely():
     assert all(r.state == "open" for r in plan.runners[14:])
     text = explain(plan)
     assert "tolerance 0.5 is met by rung 13" in text
-    assert "left out, dearer than what was chosen: rung 14 (0.440); rung 15; " in text
-    assert "half the tolerance, 0.25: dearer rungs were not judged" in text
+    assert "Left out of 20 rungs:" in text
+    assert "- 6: dearer than what was chosen; best judged: rung 14 (0.440)\n" in text
+    assert "Half the tolerance, 0.25: dearer rungs were not judged" in text
 
 
 def test_an_interruption_keeps_what_is_known():
@@ -175,7 +176,7 @@ def test_a_plan_of_probes_is_a_file_with_their_places(tmp_path):
     scene = panel_scene(floor=2.0)
     plan = make_plan(scene, tmp_path, tolerance=9.0, component="direct", rungs=[rung], levels=levels, moving=1000)
     assert plan.chosen is not None and len(plan.probes) == len(plan.config.probes) > 0
-    assert "a solve with the lookups of 1000 receivers that move" in explain(plan)
+    assert "a solve with the lookups of 1000 receivers that move" in " ".join(explain(plan).split())
     plan.save(tmp_path / "plan.json")
     file = read_config_file(tmp_path / "plan.json")
     assert file.config == plan.config and file.cells == 8 and file.scene == (scene.name, scene.hash)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -70,6 +71,7 @@ def run(args: argparse.Namespace) -> int:
     from difflpv.io import load_scene
     from difflpv.planning.explain import explain
     from difflpv.planning.plan import make_plan
+    from difflpv.planning.truth import LEVELS
 
     if args.out.suffix != ".json":
         raise UsageError(f"--out: expected a file name ending in .json, got {args.out}")
@@ -91,16 +93,17 @@ def run(args: argparse.Namespace) -> int:
             seed=args.seed,
             workers=args.workers,
             moving=args.moving,
-            tell=(lambda runner: None) if args.json else _tell,
+            tell=(lambda runner: None) if args.json else partial(_tell, levels=len(LEVELS)),
         )
     if plan.best is not None:
         plan.save(args.out)
     if args.json:
         print_json({"command": "plan", **plan.to_json(), "out": args.out if plan.best is not None else None})
     else:
-        print(f"\n{scene.name}, {args.component}: {explain(plan)}")
+        print(f"\n{scene.name}, {args.component}\n{explain(plan)}")
         if plan.best is not None:
-            print(f"\nplanning took {plan.seconds['all']:.0f} s, {plan.seconds['truth']:.0f} s of it for truth -> {args.out}")
+            print(f"\nplanning took {plan.seconds['all']:.0f} s, {plan.seconds['truth']:.0f} s of it to trace the truth")
+            print(f"plan, with all rungs: {args.out}")
         if plan.config is not None:
             print(f"to use it: difflpv render {args.scene} --config {args.out} --out {args.out.with_suffix('.exr')}")
     if plan.interrupted:
@@ -108,8 +111,8 @@ def run(args: argparse.Namespace) -> int:
     return 0 if plan.chosen is not None else 1
 
 
-def _tell(runner: Runner) -> None:
+def _tell(runner: Runner, levels: int) -> None:
     assert runner.estimate is not None and runner.seconds is not None
     e = runner.estimate
-    cost = f"{1e3 * runner.seconds:8.2f} ms"
-    print(f"level {runner.level}  error {e.error:.3f} ({e.low:.3f} to {e.high:.3f}) {cost}  {runner.rung.name}", flush=True)
+    error, cost = f"{e.error:.3f} ({e.low:.3f} to {e.high:.3f})", f"{1e3 * runner.seconds:8.2f} ms"
+    print(f"level {runner.level + 1} of {levels}  error {error} {cost}  {runner.rung.name}", flush=True)

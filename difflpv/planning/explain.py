@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import math
+import textwrap
+from collections.abc import Sequence
 
 from difflpv.planning.plan import Plan
 from difflpv.planning.race import Runner
 
 __all__ = ["bought_table", "explain", "half_tolerance", "left_out"]
+
+_WIDTH = 100
+_FAR = 100.0  # times the time: nothing that was measured foretells so far
 
 _STATES = {
     "out": "error surely too large",
@@ -20,7 +25,7 @@ _STATES = {
 
 
 def explain(plan: Plan) -> str:
-    """The whole report."""
+    """The whole report, in lines of at most 100 characters."""
     parts = [_verdict(plan)]
     if plan.best is not None:
         parts += [bought_table(plan), left_out(plan), half_tolerance(plan)]
@@ -28,62 +33,76 @@ def explain(plan: Plan) -> str:
 
 
 def _verdict(plan: Plan) -> str:
+    """What was found, and whether it meets the goal."""
     goal = f"tolerance {plan.tolerance:g}" if plan.tolerance is not None else f"budget {1e3 * (plan.budget or 0):g} ms"
     best = plan.best
     if best is None:
         return f"{goal}: nothing was judged" + (" before the interruption" if plan.interrupted else " within it")
     assert best.estimate is not None and best.seconds is not None
     e = best.estimate
-    bound = f"below {e.high:.3f} with {100 * plan.confidence:.4g} %"
-    found = f"{best.rung.name}: error {e.error:.3f} ({bound}), {1e3 * best.seconds:.2f} ms a solve"
+    found = f"{best.rung.name}: error {e.error:.3f} (below {e.high:.3f} with {100 * plan.confidence:.4g} %), "
+    found += f"{1e3 * best.seconds:.2f} ms a solve"
     if plan.moving:
         found += f" with the lookups of {plan.moving} receivers that move"
+    if best.rung.config is None:
+        found += "; it solves nothing: every receiver gets the mean of the path-traced truth"
     if plan.chosen is not None:
-        return f"{goal} is met by {found}"
+        return _filled(f"{goal} is met by {found}")
     if best.level < plan.last_level:
         found += f"; judged roughly, on level {best.level + 1} of {plan.last_level + 1}"
     if plan.interrupted:
-        return f"{goal}: interrupted; best so far {found}"
-    return f"{goal} is not met by anything on the ladder; best found {found}"
+        return _filled(f"{goal}: interrupted; best so far {found}")
+    return _filled(f"{goal} is not met by anything on the ladder; best found {found}")
 
 
 def bought_table(plan: Plan) -> str:
-    """Markdown table: from rung to rung of the front, what the error and the cost were before and after.
+    """Markdown table: from rung to rung of the front to the best, what the error fell to and what it cost.
 
     Errors of early levels are rough: they were enough to reject.
     """
-    rows = ["| rung | error before | after | judged on level | cost before [ms] | after |", "|---|---|---|---|---|---|"]
-    before: Runner | None = None
-    for runner in plan.front:
-        rows.append(
-            f"| {runner.rung.name} | {_error(before)} | {_error(runner)} | {runner.level + 1} of {plan.last_level + 1} | "
-            f"{_milliseconds(before)} | {_milliseconds(runner)} |"
-        )
-        before = runner
-    return "\n".join(rows)
+    rows = [("rung", "error", "ms a solve", "judged on level")]
+    rows += [(r.rung.name, _error(r), _milliseconds(r), f"{r.level + 1} of {plan.last_level + 1}") for r in plan.front]
+    widths = [max(len(row[k]) for row in rows) for k in range(4)]
+
+    def line(cells: Sequence[str]) -> str:
+        numbers = [cell.rjust(width) for cell, width in zip(cells[1:], widths[1:], strict=True)]
+        return f"| {' | '.join([cells[0].ljust(widths[0]), *numbers])} |"
+
+    rule = [("-" * (width - 1) + ":") if k else "-" * width for k, width in enumerate(widths)]
+    return "\n".join(map(line, (rows[0], rule, *rows[1:])))
 
 
-def _error(runner: Runner | None) -> str:
-    return "" if runner is None or runner.estimate is None else f"{runner.estimate.error:.3f}"
+def _error(runner: Runner) -> str:
+    return "" if runner.estimate is None else f"{runner.estimate.error:.3f}"
 
 
-def _milliseconds(runner: Runner | None) -> str:
-    return "" if runner is None or runner.seconds is None else f"{1e3 * runner.seconds:.2f}"
+def _milliseconds(runner: Runner) -> str:
+    return "" if runner.seconds is None else f"{1e3 * runner.seconds:.2f}"
 
 
 def left_out(plan: Plan) -> str:
-    """One line per reason, naming the rungs."""
+    """A list: how many rungs for each reason, and the nearest of them to being chosen."""
     lines = []
     for state, reason in _STATES.items():
         if state == "out" and plan.budget is not None:
             reason = "less accurate"
         if state == "open" and (plan.interrupted or plan.chosen is None):
             reason = "not judged to the end"
-        names = [f"{r.rung.name} ({_error(r)})" if r.estimate else r.rung.name for r in plan.runners if r.state == state]
-        names = [name for name in names if plan.best is None or not name.startswith(plan.best.rung.name + " (")]
-        if names:
-            lines.append(f"left out, {reason}: {'; '.join(names)}")
-    return "\n".join(lines)
+        runners = [r for r in plan.runners if r.state == state and r is not plan.best]
+        if runners:
+            lines.append(_filled(f"- {len(runners)}: {reason}{_nearest(state, runners)}", indent="  "))
+    return "\n".join([f"Left out of {len(plan.runners)} rungs:", "", *lines]) if lines else ""
+
+
+def _nearest(state: str, runners: Sequence[Runner]) -> str:
+    """Of what was over the budget the cheapest, else the most accurate, of those judged."""
+    if state == "dear":
+        timed = [r for r in runners if r.seconds is not None]
+        nearest = min(timed, key=lambda r: r.seconds or 0.0, default=None)
+        return "" if nearest is None else f"; the cheapest timed: {nearest.rung.name} ({_milliseconds(nearest)} ms)"
+    judged = [r for r in runners if r.estimates]
+    nearest = min(judged, key=lambda r: r.estimates[-1].error, default=None)
+    return "" if nearest is None else f"; best judged: {nearest.rung.name} ({_error(nearest)})"
 
 
 def half_tolerance(plan: Plan) -> str:
@@ -95,20 +114,26 @@ def half_tolerance(plan: Plan) -> str:
     enough = [r for r in left if plan.foreseen(r) <= half]
     if enough:
         least = min(enough, key=lambda r: r.seconds or 0.0)
-        return f"half the tolerance, {half:g}: likely {least.rung.name} ({plan.foreseen(least):.3f}), {_milliseconds(least)} ms"
+        likely = f"{least.rung.name} ({plan.foreseen(least):.3f}), {_milliseconds(least)} ms"
+        return _filled(f"Half the tolerance, {half:g}: likely {likely}")
     front = [r for r in plan.front if r.seconds and r.estimate]
     waiting = any(r.state == "open" for r in plan.runners)
-    hope = "dearer rungs were not judged" if waiting else "nothing on the ladder reached it"
+    hope = f"Half the tolerance, {half:g}: {'dearer rungs were not judged' if waiting else 'nothing on the ladder reached it'}"
     if len(front) < 2:
-        return f"half the tolerance, {half:g}: {hope}"
+        return hope
     first, last = front[0], front[-1]
     assert first.estimate and last.estimate and first.seconds and last.seconds
     fall = math.log(first.estimate.error / max(last.estimate.error, 1e-12))
     power = fall / math.log(last.seconds / first.seconds) if last.seconds > first.seconds else 0.0
-    if power < 0.05:
-        return f"half the tolerance, {half:g}: {hope}, and more time has bought next to nothing so far"
+    far = math.log(last.estimate.error / half) >= power * math.log(_FAR)
+    if power <= 0 or far:
+        return _filled(f"{hope}; going by the table, not even {_FAR:g} times the time would reach it")
     factor = (last.estimate.error / half) ** (1 / power)
-    return (
-        f"half the tolerance, {half:g}: {hope}; the error has fallen as time to the power {-power:.2f}: if that went on, about "
-        f"{factor:.3g} times the {_milliseconds(last)} ms of {last.rung.name}"
+    return _filled(
+        f"{hope}; going by the table (error as time to the power {-power:.2f}), it takes about {factor:.2g} times the "
+        f"{_milliseconds(last)} ms of {last.rung.name}"
     )
+
+
+def _filled(text: str, *, indent: str = "") -> str:
+    return textwrap.fill(text, _WIDTH, subsequent_indent=indent, break_on_hyphens=False, break_long_words=False)

@@ -141,17 +141,26 @@ class SceneJudge:
         assert rung.config is not None
         return replace(rung.config, lookup="affine"), rung.cells  # however it is read
 
-    @torch.no_grad()
-    def retime(self, rung: Configuration, repeats: int = 5) -> float:
-        """``seconds``, the least of all and of ``repeats`` more solves (inject, propagate, light probes)."""
-        begin, config = time.perf_counter(), self.config(rung)
-        if config is not None:
-            number = min(self._levels[min(self._levels)].sets) if self._levels else 0
-            light = self._illuminate(config, self.grid(rung), number)
-            for _ in range(repeats):
-                self._time_reading(rung, light, self._timed(rung, light))
+    def solve_of(self, rung: Configuration) -> Callable[[], float]:
+        """What solves a judged rung once more under the first light, with its lookups, and returns its seconds.
+
+        That is: inject, propagate, light probes; 0 for what solves nothing. Its set-up is done here.
+        """
+        config = self.config(rung)
+        if config is None:
+            return lambda: 0.0
+        begin, light = time.perf_counter(), self._illuminate(config, self.grid(rung), self._truth_of(0).sets[0])
         self.spent["rungs"] += time.perf_counter() - begin
-        return self.seconds(rung)
+
+        @torch.no_grad()
+        def solve() -> float:
+            begin = time.perf_counter()
+            solved, seconds = self._timed(rung, light)
+            seconds += self._time_reading(rung, light, solved)
+            self.spent["rungs"] += time.perf_counter() - begin
+            return seconds
+
+        return solve
 
     @torch.no_grad()
     def _predicted(self, rung: Configuration, truth: LevelTruth, number: int) -> np.ndarray:
@@ -162,7 +171,7 @@ class SceneJudge:
         key = (volume, number)
         if key not in self._solved:
             first = volume not in self._seconds
-            self._solved[key] = self._timed(rung, light)
+            self._solved[key], _ = self._timed(rung, light)
             kind = (config.method, config.occlusion, config.coarsen_after is None)
             if (first and self._seconds[volume] < _SHORT) or kind not in self._warm:  # the first of a kind loads its kernels
                 self._warm.add(kind)
@@ -175,31 +184,36 @@ class SceneJudge:
         parts = [lpv.gather(solved, light, self._seen(config, grid, light, part, number)) for part in truth.parts]
         return torch.cat(parts).double().numpy()
 
-    def _timed(self, rung: Configuration, light: Illumination) -> tuple[torch.Tensor, ...]:
+    def _timed(self, rung: Configuration, light: Illumination) -> tuple[tuple[torch.Tensor, ...], float]:
         lpv, volume, begin = Lpv(light.grid, light.config), self._volume(rung), _clock()
         solved = lpv.accumulate(light)
-        self._seconds[volume] = min(_clock() - begin, self._seconds.get(volume, np.inf))  # what disturbs can only add
-        return solved
+        seconds = _clock() - begin
+        self._seconds[volume] = min(seconds, self._seconds.get(volume, np.inf))  # what disturbs can only add
+        return solved, seconds
 
-    def _time_reading(self, rung: Configuration, light: Illumination, solved: Sequence[torch.Tensor]) -> None:
-        """Time what lights a rung's probes and, where receivers move, their lookups."""
+    def _time_reading(self, rung: Configuration, light: Illumination, solved: Sequence[torch.Tensor]) -> float:
+        """Time [s] of what lights a rung's probes and, where receivers move, of their lookups."""
+        seconds = 0.0
         if rung.probes is not None:
             grids, reads, gains = light.config.grids(light.grid), light.probes.reads, torch.ones(COEFFS)
-            self._least(self._lighting, rung.name, lambda: probe_radiance(solved, grids, reads, gains))
+            seconds += self._one(self._lighting, rung.name, lambda: probe_radiance(solved, grids, reads, gains))
         if self.moving:
             table, lpv = self.truth.receivers(0), Lpv(light.grid, light.config)
             position, normal = (np.resize(a, (_MANY, 3)).astype(float) for a in (table.position, table.normal))
-            self._least(
+            seconds += self.moving * self._one(
                 self._reading, rung.name, lambda: lpv.gather(solved, light, light.receivers(position, normal)), count=_MANY
             )
+        return seconds
 
-    def _least(self, known: dict[str, float], name: str, work: Callable[[], object], *, count: int = 1) -> None:
-        """Keep the least time of ``work`` over ``count``; the first is not counted, for it loads kernels and tables."""
-        for again in (False, True) if name not in known else (True,):
-            begin = _clock()
+    def _one(self, known: dict[str, float], name: str, work: Callable[[], object], *, count: int = 1) -> float:
+        """Time of ``work`` over ``count``; keeps the least. The first is not counted, for it loads kernels and tables."""
+        if name not in known:
             work()
-            if again:
-                known[name] = min((_clock() - begin) / count, known.get(name, np.inf))
+        begin = _clock()
+        work()
+        seconds = (_clock() - begin) / count
+        known[name] = min(seconds, known.get(name, np.inf))
+        return seconds
 
     def _illuminate(self, config: LpvConfig, grid: Grid, number: int) -> Illumination:
         """The scene under a light set; VPLs and the cells that they give to are ready: no part of a solve."""

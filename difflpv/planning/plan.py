@@ -56,9 +56,15 @@ class Plan:
 
     @property
     def best(self) -> Runner | None:
-        """What is chosen, or else the most accurate rung judged (within the budget), by the level that all were judged on."""
+        """What is chosen; after an interruption the cheapest that surely meets the tolerance.
+
+        Or else the most accurate rung judged (within the budget), by the level that all were judged on.
+        """
         if self.chosen is not None:
             return self.chosen
+        met = [r for r in self.runners if r.state == "met"]
+        if met:
+            return min(met, key=lambda r: (r.seconds, r.work))
         judged = [r for r in self.runners if r.estimates and r.state != "dear"]
         return min(judged, key=lambda r: r.estimates[0].error, default=None)
 
@@ -77,14 +83,17 @@ class Plan:
 
     @property
     def front(self) -> list[Runner]:
-        """Judged rungs that are more accurate than all cheaper ones, cheapest first, up to the best one."""
+        """Judged rungs that are more accurate than all cheaper ones, cheapest first, and the best one after them.
+
+        That one may show a larger error than a cheaper one that was judged less closely.
+        """
         found: list[Runner] = []
         judged = [r for r in self.runners if r.estimate is not None and r.seconds is not None]
         for runner in sorted(judged, key=lambda r: (r.seconds, r.work)):
+            if runner is self.best:
+                return [*found, runner]
             if not found or _error(runner) < _error(found[-1]):
                 found.append(runner)
-            if runner is self.best:
-                break
         return found
 
     def to_json(self) -> dict[str, Any]:

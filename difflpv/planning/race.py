@@ -25,17 +25,15 @@ from typing import Protocol
 from difflpv.bench.configuration import Configuration
 from difflpv.error_bounds import Estimate
 from difflpv.planning.ladder import family_of
+from difflpv.planning.timing import cheapest_of, time_rivals
 
 __all__ = ["Judge", "Runner", "cheapest", "most_accurate"]
 
-_TIE = 1.1  # costs closer than this are told apart by their work
 _FIRST_RATE = 1e-11  # s per product, before anything is measured
 _FINER = 1.5  # times as much work a second may be done in finer cells
 _OTHER_KIND = 2.5  # or by another kind of solve
 _ABOVE_BASE = 3.0  # times the cheapest solve: what takes so long tells the rate of the work
-_ROUGH = 1.25  # a time of one or two runs may be so far off
-_REPEATS = 5  # of a solve whose time decides
-_ENOUGH = 0.1  # s of them: long solves scatter less
+_NEAR = 1.25  # a rung so many times over the budget may still turn out to be within it
 _COLD = 4.0  # times a first run on a busy machine may take
 _PREDICTION = 1.5  # a rung predicted to be so many times over the budget is not measured
 _MARGIN = 1.1  # between the ratios of errors on two levels of two rungs
@@ -63,8 +61,8 @@ class Judge(Protocol):
     def judge(self, rung: Configuration, level: int) -> tuple[Estimate, float]:
         """Error on this level, and seconds of one solve with its lookups, roughly: the least of all so far."""
 
-    def retime(self, rung: Configuration, repeats: int = 5) -> float:
-        """Seconds of one solve, the least of all so far and of ``repeats`` more; of a rung that was judged."""
+    def solve_of(self, rung: Configuration) -> Callable[[], float]:
+        """What solves a judged rung once more, with its lookups, and returns the seconds that it took; its set-up is done."""
 
 
 @dataclass(eq=False)
@@ -122,9 +120,9 @@ class _Field:
         others = [rate / _OTHER_KIND for _, rate in rates]
         return base + runner.work * min(own or others, default=_FIRST_RATE)
 
-    def key(self, runner: Runner) -> tuple[int, float]:
-        """Order of the climb: costs within a tie are one."""
-        return round(math.log(max(self.cost(runner), 1e-9)) / math.log(_TIE)), runner.work
+    def next(self, waiting: Sequence[Runner]) -> Runner:
+        """The cheapest; of costs within a tie that of least work."""
+        return cheapest_of({r: self.cost(r) for r in waiting}, {r: r.work for r in waiting})
 
     def advance(self, runner: Runner, level: int) -> Estimate:
         estimate, seconds = self.judge.judge(runner.rung, level)
@@ -133,8 +131,10 @@ class _Field:
         self.tell(runner)
         return estimate
 
-    def retime(self, runner: Runner, repeats: int = _REPEATS) -> None:
-        runner.seconds = min(self.judge.retime(runner.rung, repeats), self.cost(runner) or math.inf) if runner.work else 0.0
+    def timed(self, runners: Sequence[Runner]) -> dict[Runner, float]:
+        """Seconds of those whose rough times leave open which is the cheapest, taken anew in turns."""
+        rough = {r: r.seconds for r in runners if r.seconds is not None}
+        return time_rivals(rough, lambda runner: self.judge.solve_of(runner.rung))
 
     def lost(self, estimate: Estimate, level: int, tolerance: float) -> str | None:
         """Why a rung that was so judged on a level is rejected ("out", "unsure"), or None."""
@@ -241,7 +241,7 @@ def cheapest(
     race = _Field(_start(rungs, judge, runners), judge, tell)
     last = len(judge.slack) - 1
     while waiting := [r for r in race.runners if r.state in ("open", "met")]:
-        runner = min(waiting, key=race.key)
+        runner = race.next(waiting)
         if runner.state == "met":
             runner.state = "chosen"
             return runner
@@ -258,9 +258,8 @@ def cheapest(
                 runner.state = "unsure"
                 continue
             runner.state = "met"  # times were rough so far: is it the cheapest?
-            rivals = [r for r in waiting if r.seconds is not None and race.cost(r) <= _ROUGH * race.cost(runner)]
-            for rival in rivals if len(rivals) > 1 else ():
-                race.retime(rival, max(1, min(_REPEATS, round(_ENOUGH / max(race.cost(rival), 1e-9)))))
+            for rival, seconds in race.timed(waiting).items():
+                rival.seconds = seconds
     return None
 
 
@@ -276,20 +275,22 @@ def most_accurate(
     if not (budget > 0 and math.isfinite(budget)):
         raise ValueError(f"budget: expected a positive number of seconds, got {budget}")
     race = _Field(_start(rungs, judge, runners), judge, tell)
-    for level in range(len(judge.slack)):
-        for runner in sorted((r for r in race.runners if r.state == "open"), key=race.key):
+    last = len(judge.slack) - 1
+    for level in range(last + 1):
+        for runner in sorted((r for r in race.runners if r.state == "open"), key=lambda r: (race.cost(r), r.work)):
             if runner.seconds is None and race.cost(runner) > _PREDICTION * budget:
                 runner.state = "dear"
                 continue
             race.advance(runner, level)
-            if level == len(judge.slack) - 1 or budget < race.cost(runner) <= _COLD * budget:
-                race.retime(runner)
-            if race.cost(runner) > budget * (1 if level == len(judge.slack) - 1 else _ROUGH):
+            if level == last or budget < race.cost(runner) <= _COLD * budget:
+                for seconds in race.timed([runner]).values():  # what was within the budget once stays so
+                    runner.seconds = min(seconds, race.cost(runner))
+            if race.cost(runner) > budget * (1 if level == last else _NEAR):
                 runner.state = "dear"
         left = sorted((r for r in race.runners if r.state == "open"), key=lambda r: _error(r).error)
         if not left:
             return None
-        if level < len(judge.slack) - 1:
+        if level < last:
             inside = [r for r in left if race.cost(r) <= budget]  # others may turn out to be, but push nobody out
             bar = min((_error(r).high for r in inside), default=math.inf)
             kept = inside[: max(2, math.ceil(len(inside) / 2))]
