@@ -93,6 +93,17 @@ def test_errors_are_one_line(arguments, message, folder, tmp_path, capsys) -> No
     assert message in error and error.count("\n") == 1
 
 
+@pytest.mark.parametrize(("format", "out"), [("threejs", "probes.json"), ("exr", "probes.exr"), ("filament", "")])
+def test_an_export_does_not_replace_what_it_reads(format, out, folder, capsys) -> None:
+    before = {file: file.read_bytes() for file in folder.iterdir()}
+    assert difflpv("probes", "export", folder, "--format", format, "--out", folder / out) == 2
+    line = f"difflpv: error: {folder / 'probes.json'}: describes light probes of difflpv, which would be lost"
+    error = capsys.readouterr().err
+    assert error.startswith(line) and error.count("\n") == 1
+    assert {file: file.read_bytes() for file in folder.iterdir()} == before
+    assert difflpv("probes", "export", folder, "--format", "gltf", "--out", folder / "probes.gltf") == 0
+
+
 def test_no_probes_there_is_one_line(tmp_path, capsys) -> None:
     assert difflpv("probes", "export", tmp_path, "--format", "gltf", "--out", tmp_path / "a.gltf") == 2
     assert capsys.readouterr().err.startswith(f"difflpv: error: {tmp_path / 'probes.json'}: not found: expected a folder")

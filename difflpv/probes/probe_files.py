@@ -25,7 +25,7 @@ from difflpv.io.atomic import write_bytes, write_json
 from difflpv.probes.probe_set import COEFFS, ProbeSet
 from difflpv.probes.reader import ProbeReader
 
-__all__ = ["CONVENTION", "MAX_PROBES", "ProbeFileError", "ProbeRecord", "load_probes", "save_probes"]
+__all__ = ["CONVENTION", "MAX_PROBES", "ProbeFileError", "ProbeRecord", "describes_probes", "load_probes", "save_probes"]
 
 MAX_PROBES = 2**20
 """More probes than that are refused: some 250 MB of coefficients."""
@@ -136,6 +136,11 @@ def save_probes(folder: str | Path, record: ProbeRecord) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     write_bytes(folder / _TENSORS, content)
     write_json(folder / _JSON, described)
+
+
+def describes_probes(path: Path) -> bool:
+    """Whether a file is the ``probes.json`` of saved probes, whose numbers lie beside it."""
+    return path.name == _JSON and path.is_file() and (path.parent / _TENSORS).is_file()
 
 
 def load_probes(folder: str | Path) -> ProbeRecord:

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 import difflpv
-from difflpv.probes.probe_files import ProbeRecord
+from difflpv.probes.probe_files import ProbeRecord, describes_probes
 from difflpv.probes.probe_set import ProbeSet
 from difflpv.sh import lobe_factors
 
@@ -25,6 +25,7 @@ __all__ = [
     "ENGINE_READS",
     "ExportError",
     "check_file",
+    "check_own",
     "convention_record",
     "make_folder",
     "metric_records",
@@ -158,6 +159,13 @@ def check_file(out: Path, suffix: str) -> Path:
         raise ExportError(f"{out}: expected a file name ending in {suffix}")
     make_folder(out.parent)
     return out
+
+
+def check_own(file: Path) -> Path:
+    """``file``; an ``ExportError`` where probes in the own format are described there, which an export must not replace."""
+    if describes_probes(file):
+        raise ExportError(f"{file}: describes light probes of difflpv, which would be lost; choose another place")
+    return file
 
 
 def make_folder(folder: Path) -> Path:

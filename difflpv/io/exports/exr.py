@@ -15,7 +15,15 @@ from typing import Literal
 import numpy as np
 
 from difflpv.io.atomic import write_json
-from difflpv.io.exports.convention import ENGINE_READS, ExportError, check_file, convention_record, rounded, usable_probes
+from difflpv.io.exports.convention import (
+    ENGINE_READS,
+    ExportError,
+    check_file,
+    check_own,
+    convention_record,
+    rounded,
+    usable_probes,
+)
 from difflpv.io.exr import write_exr
 from difflpv.probes.probe_files import ProbeRecord
 from difflpv.probes.probe_set import irradiance_of
@@ -48,6 +56,7 @@ def export_exr(
         height: rows of one map; it is twice as wide.
     """
     check_file(out, ".exr")
+    described = check_own(out.with_suffix(".json"))
     if quantity not in ("irradiance", "radiance"):
         raise ValueError(f"quantity: expected irradiance or radiance, got {quantity!r}")
     if not 2 <= height <= 1024:
@@ -78,7 +87,6 @@ def export_exr(
         tile=[2 * height, height],
         columns=columns,
     )
-    described = out.with_suffix(".json")
     channels = {name: atlas[:, :, k] for k, name in enumerate("RGB")}
     write_exr(out, channels, {"difflpv:convention": json.dumps(convention)})
     write_json(described, {"convention": convention, "positions": rounded(probes.position)})

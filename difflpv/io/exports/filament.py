@@ -15,6 +15,7 @@ from pathlib import Path
 from difflpv.io.atomic import write_json, write_text
 from difflpv.io.exports.convention import (
     ENGINE_READS,
+    check_own,
     convention_record,
     make_folder,
     polynomial_coefficients,
@@ -39,7 +40,7 @@ def export_filament(record: ProbeRecord, out: Path) -> list[Path]:
     probes = usable_probes(record)
     coefficients = polynomial_coefficients(probes.radiance)
     rounded(coefficients)  # refuses what float32 cannot hold
-    index, files = out / "probes.json", []
+    index, files = check_own(out / "probes.json"), []
     with contextlib.suppress(FileNotFoundError):
         index.unlink()  # an export that was cut off has no index
     for k, probe in enumerate(coefficients):

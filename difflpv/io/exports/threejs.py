@@ -16,6 +16,7 @@ from difflpv.io.atomic import write_json
 from difflpv.io.exports.convention import (
     ENGINE_READS,
     check_file,
+    check_own,
     convention_record,
     metric_records,
     reader_record,
@@ -34,7 +35,7 @@ _SOURCES = (
 
 def export_threejs(record: ProbeRecord, out: Path) -> list[Path]:
     """Write one ``.json`` file."""
-    check_file(out, ".json")
+    check_own(check_file(out, ".json"))
     probes = usable_probes(record)
     convention = convention_record(
         record,
