@@ -28,12 +28,14 @@ __all__ = [
     "check_files",
     "check_made_for",
     "file_digest",
+    "light_of_table",
     "load_targets",
     "read_manifest",
 ]
 
 MANIFEST = "manifest.json"
 KIND = "difflpv-targets"
+_MADE_BY = {KIND: "difflpv targets", "difflpv-probe-targets": "difflpv probes targets"}
 FORMAT = 1
 
 
@@ -122,14 +124,30 @@ def read_manifest(folder: str | Path, kind: str = KIND) -> dict[str, Any] | None
         manifest = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise TargetsError(f"{path}: damaged manifest: {' '.join(str(error).split())}") from None
-    if not isinstance(manifest, dict) or manifest.get("kind") != kind:
-        raise TargetsError(f"{path}: not a manifest of {kind.removeprefix('difflpv-').replace('-', ' ')}")
+    found = manifest.get("kind") if isinstance(manifest, dict) else None
+    if found != kind:
+        other = f": '{_MADE_BY[found]}' made it, expected '{_MADE_BY[kind]}'" if found in tuple(_MADE_BY) else ""
+        raise TargetsError(f"{path}: not a manifest of {kind.removeprefix('difflpv-').replace('-', ' ')}{other}")
     if manifest.get("format") != FORMAT:
         raise TargetsError(f"{path}: format {manifest.get('format')!r}, this version reads format {FORMAT}")
     for key, expected in (("request", dict), ("files", dict), ("lights", list)):
         if not isinstance(manifest.get(key), expected):
             raise TargetsError(f"{path}: damaged manifest: '{key}' is missing")
     return manifest
+
+
+def light_of_table(path: str | Path) -> str | None:
+    """Hash of the scene under the lights that a table ``light_<k>.npz`` of finished targets holds the truth of, else None."""
+    path = Path(path)
+    try:
+        manifest = read_manifest(path.parent)
+    except TargetsError:
+        return None
+    number = path.stem.removeprefix("light_")
+    if manifest is None or path.name not in manifest["files"] or not number.isdecimal():
+        return None
+    lights = manifest["request"].get("lights", [])
+    return str(lights[int(number)]) if int(number) < len(lights) else None
 
 
 def check_files(folder: Path, kind: str = KIND) -> dict[str, Any]:
@@ -140,7 +158,8 @@ def check_files(folder: Path, kind: str = KIND) -> dict[str, Any]:
     """
     manifest = read_manifest(folder, kind)
     if manifest is None:
-        reason = "no such folder" if not folder.is_dir() else f"no {MANIFEST}: not targets, or not finished"
+        missing = "expected a folder, got a file" if folder.exists() else "no such folder"
+        reason = missing if not folder.is_dir() else f"no {MANIFEST}: not targets, or not finished"
         raise TargetsError(f"{folder}: {reason}")
     for name, digest in manifest["files"].items():
         path = folder / name

@@ -174,7 +174,7 @@ def test_other_requests_damage_and_bad_arguments_are_refused(made, tmp_path):
     scene = block_room()
     with pytest.raises(TargetsError, match=r"another request \(different lights, points, component\)"):
         make_probe_targets(scene, made.folder, **(SMALL | {"component": "direct", "count": 61}))
-    with pytest.raises(TargetsError, match="not a manifest of targets"):
+    with pytest.raises(TargetsError, match="of targets: 'difflpv probes targets' made it, expected 'difflpv targets'"):
         load_targets(made.folder)
     tiny = {"count": 4, "cells": 3, "spp": 32, "lattice_spp": 32}
     kept = make_probe_targets(scene, tmp_path, **tiny)

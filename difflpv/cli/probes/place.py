@@ -60,8 +60,7 @@ def add_parser(subparsers: Any) -> None:
     )
     parser.add_argument(
         "--targets", type=Path, metavar="DIR",
-        help="from 'difflpv probes targets'; where it is left out or not there, targets are made by that command's defaults "
-        "into OUT/targets",
+        help="from 'difflpv probes targets'; where it is left out, they are made by that command's defaults into OUT/targets",
     )  # fmt: skip
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the probes")
     parser.add_argument(
@@ -116,8 +115,6 @@ def run(args: argparse.Namespace) -> int:
     options = _options(args)
     scene = load_scene(args.scene)
     warnings = list(scene.warnings)
-    if args.targets is not None and not args.targets.exists():
-        warnings.append(f"--targets: no folder {args.targets}, targets are made into {args.out / 'targets'}")
     warn(warnings)
     targets = _targets(args, scene)
     lights = tuple(range(len(targets.light_sets))) if args.lights is None else args.lights
@@ -171,7 +168,7 @@ def _targets(args: argparse.Namespace, scene: Scene) -> ProbeTargets:
     """Those of the folder, or new ones by default."""
     from data_gen.probe_targets import load_probe_targets, make_probe_targets
 
-    if args.targets is not None and args.targets.exists():
+    if args.targets is not None:
         targets = load_probe_targets(args.targets)
         targets.check_scene(scene)
         return targets
