@@ -126,6 +126,61 @@ def test_a_table_without_weight_and_truth(room, table, tmp_path, capsys):
     assert content["config"] == LpvConfig(steps=2, clamp=False, deposit="trilinear").to_json()
 
 
+def test_the_truth_of_another_light_judges_nothing(room, table, tmp_path, capsys):
+    """A table of targets is the truth under its own light set; one that stands apart from them is taken at its word."""
+    command = ["simulate", room / "room.glb", "--steps", 4, "--out", tmp_path / "p.npz"]
+    content, err = run_json(capsys, *command, "--receivers", table)
+    assert content["scores"] == [] and "the truth under another scene or light set" in content["warnings"][-1]
+    assert f"warning: {table}: the truth under" in err
+    lights = ("--lights", room / "sets.json", "--light", 1)
+    content, _ = run_json(capsys, *command, *lights, "--receivers", table)
+    assert len(content["scores"]) == 2 and content["warnings"] == []
+    save_table(tmp_path / "light_1.npz", **load_table(table))
+    content, _ = run_json(capsys, *command, "--receivers", tmp_path / "light_1.npz")
+    assert len(content["scores"]) == 2
+
+
+def test_a_truth_that_is_no_number_is_told(room, table, tmp_path, capsys):
+    columns = load_table(table)
+    columns["irr_bounce1"][3, 1] = np.nan
+    np.savez(tmp_path / "t.npz", **columns)
+    command = ["simulate", room / "room.glb", "--steps", 4, "--receivers", tmp_path / "t.npz", "--out", tmp_path / "p.npz"]
+    content, _ = run_json(capsys, *command)
+    assert content["scores"] == [] and content["warnings"] == [
+        f"{tmp_path / 't.npz'}: irr_bounce1: row 3 is not finite, no error is told"
+    ]
+    save_table(tmp_path / "t.npz", **columns | {"irr_bounce1": np.zeros((40, 3))})
+    content, _ = run_json(capsys, *command)
+    assert content["warnings"] == [f"{tmp_path / 't.npz'}: irr_bounce1 is 0 everywhere, no relative error is told"]
+
+
+@pytest.mark.parametrize("command", ["simulate", "render"])
+def test_a_place_where_nothing_can_be_written_is_told_before_the_work(command, room, table, tmp_path, capsys, monkeypatch):
+    for name in ("difflpv.simulate.simulate", "difflpv.simulate.render"):
+        monkeypatch.setattr(name, None)
+    (tmp_path / "file").touch()
+    (tmp_path / "folder.npz").mkdir()
+    (tmp_path / "folder.exr").mkdir()
+    suffix = {"simulate": ".npz", "render": ".exr"}[command]
+    own = [command, room / "room.glb", *(["--receivers", table] if command == "simulate" else [])]
+    for out, message in (
+        (tmp_path / "file" / f"a{suffix}", f"--out: folder {tmp_path / 'file'} cannot be made: "),
+        (tmp_path / f"folder{suffix}", f"--out: expected a file, {tmp_path / f'folder{suffix}'} is a folder"),
+    ):
+        assert difflpv(*own, "--out", out) == 2
+        err = capsys.readouterr().err
+        assert err.startswith(f"difflpv: error: {message}") and err.count("\n") == 1
+    monkeypatch.setattr("os.access", lambda path, mode: False)
+    assert difflpv(*own, "--out", tmp_path / f"a{suffix}") == 2
+    assert capsys.readouterr().err == f"difflpv: error: --out: folder {tmp_path} cannot be written to\n"
+
+
+def test_the_table_that_is_read_is_not_replaced(room, table, capsys):
+    before = table.read_bytes()
+    assert difflpv("simulate", room / "room.glb", "--steps", 2, "--receivers", table, "--out", table) == 2
+    assert "is the table of --receivers and would be lost" in capsys.readouterr().err and table.read_bytes() == before
+
+
 def test_constant_is_the_weighted_mean_of_the_targets(room, table, tmp_path, capsys):
     command = ["simulate", room / "room.glb", "--method", "constant", "--receivers", table, "--out", tmp_path / "c.npz"]
     content, _ = run_json(capsys, *command, "--targets", room / "targets", "--light", 1)

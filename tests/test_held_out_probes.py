@@ -111,15 +111,16 @@ def test_evaluate_prints_the_table_and_says_what_is_unseen(world, capsys):
 
 def test_show_draws_one_or_two_panels_and_sums_up(world, tmp_path, capsys):
     folder, _, _, _ = world
-    command = ("probes", "show", folder / "room.glb", folder / "probes", "--out", tmp_path / "a.png")
+    figure = tmp_path / "new" / "a.png"
+    command = ("probes", "show", folder / "room.glb", folder / "probes", "--out", figure)
     assert difflpv(*command) == 0
     text = capsys.readouterr().out
-    assert "6 probes, by hand: " in text and text.endswith(f"-> {tmp_path / 'a.png'}\n")
-    alone = (tmp_path / "a.png").read_bytes()
+    assert "6 probes, by hand: " in text and text.endswith(f"-> {figure}\n")
+    alone = figure.read_bytes()
     assert difflpv(*command, "--targets", folder / "B", "--placed-by", folder / "A", "--json") == 0
     told = json.loads(capsys.readouterr().out)
     assert told["probes"] == 6 and told["lights"] == [1, 2] and told["error"] > 0
-    assert len((tmp_path / "a.png").read_bytes()) > 1.2 * len(alone)
+    assert len(figure.read_bytes()) > 1.2 * len(alone)
 
 
 def test_footprints_of_a_file_are_what_judges_read_and_tetrahedra_are_not_drawn(world, tmp_path, capsys, monkeypatch):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 
 from difflpv.cli.options import UsageError
 
-__all__ = ["Progress", "jsonable", "last_change", "make_folder", "print_json", "warn"]
+__all__ = ["Progress", "jsonable", "last_change", "make_folder", "make_folder_of", "print_json", "warn"]
 
 
 def warn(lines: Iterable[str]) -> None:
@@ -44,12 +45,21 @@ def last_change(path: Path) -> int | None:
 
 
 def make_folder(option: str, folder: Path) -> Path:
-    """Create an output folder; a ``UsageError`` names the option where that cannot be."""
+    """Create an output folder; a ``UsageError`` names the option where that cannot be, or nothing can be written there."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"{option}: folder {folder} cannot be made: {error.strerror}") from None
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise UsageError(f"{option}: folder {folder} cannot be written to")
     return folder
+
+
+def make_folder_of(option: str, file: Path) -> None:
+    """Create the folder of an output file, before the work whose result goes there; a ``UsageError`` where it cannot be."""
+    if file.is_dir():
+        raise UsageError(f"{option}: expected a file, {file} is a folder")
+    make_folder(option, file.parent)
 
 
 class Progress:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +20,7 @@ from difflpv.cli.options import (
     seeded,
     usage_errors,
 )
-from difflpv.cli.output import make_folder, print_json, warn
+from difflpv.cli.output import make_folder, make_folder_of, print_json, warn
 
 if TYPE_CHECKING:
     from difflpv.planning.race import Runner
@@ -79,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"--confidence: expected a number in [0.5, 1), got {args.confidence:g}")
     scene = load_scene(args.scene)
     warn(scene.warnings)
-    make_folder("--out", args.out.parent)
+    make_folder_of("--out", args.out)
     truth = args.truth or args.out.parent / f"plan_{scene.name}_{args.component}"
     make_folder("--truth", truth)
     with usage_errors():
@@ -105,7 +106,8 @@ def run(args: argparse.Namespace) -> int:
             print(f"\nplanning took {plan.seconds['all']:.0f} s, {plan.seconds['truth']:.0f} s of it to trace the truth")
             print(f"plan, with all rungs: {args.out}")
         if plan.config is not None:
-            print(f"to use it: difflpv render {args.scene} --config {args.out} --out {args.out.with_suffix('.exr')}")
+            use = ["difflpv", "render", args.scene, "--config", str(args.out), "--out", str(args.out.with_suffix(".exr"))]
+            print(f"to use it: {shlex.join(use)}")
     if plan.interrupted:
         return INTERRUPTED
     return 0 if plan.chosen is not None else 1

@@ -23,7 +23,7 @@ from difflpv.cli.options import (
     seeded,
     select_device,
 )
-from difflpv.cli.output import make_folder, print_json, warn
+from difflpv.cli.output import make_folder_of, print_json, warn
 from difflpv.cli.simulate import add_constant, check_targets, constant_irradiance
 from difflpv.cli.solve import Solve, add_solve, describe_solve, solve_from
 
@@ -79,6 +79,7 @@ def run(args: argparse.Namespace) -> int:
     camera = scene.cameras[args.camera]
     solve = solve_from(args, scene)
     check_floor(args, solve)
+    make_folder_of("--out", args.out)
     images, told = _images(args, scene, solve, camera)
     warnings = [*scene.warnings, *told]
     warn(warnings)
@@ -88,7 +89,6 @@ def run(args: argparse.Namespace) -> int:
         channels |= {f"{component}.{name}": image[:, :, k] for k, name in enumerate("RGB")}
     exposure = auto_exposure(total) if args.exposure is None else args.exposure
     preview = args.out.with_suffix(".png")
-    make_folder("--out", args.out.parent)
     write_exr(args.out, channels, {"scene": scene.name, "method": solve.label, "components": " ".join(images)})
     write_png(preview, total, exposure=exposure)
     seconds = time.perf_counter() - started

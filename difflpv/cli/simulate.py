@@ -22,7 +22,7 @@ from difflpv.cli.options import (
     seeded,
     select_device,
 )
-from difflpv.cli.output import make_folder, print_json, warn
+from difflpv.cli.output import make_folder_of, print_json, warn
 from difflpv.cli.solve import Solve, add_solve, describe_solve, solve_from
 
 if TYPE_CHECKING:
@@ -42,9 +42,10 @@ def add_parser(subparsers: Any) -> None:
         run,
         help="predict the irradiance of receivers",
         description="Solve a light propagation volume and write the irradiance of a table of receivers (position [n,3] m, "
-        "normal [n,3]). Where the table holds the truth (irr_direct, irr_bounce1) the error is printed too.",
+        "normal [n,3]). Where the table holds the truth (irr_direct, irr_bounce1) the error is printed too; a table of "
+        "'difflpv targets' is the truth under its own light set alone.",
         example="""
-        difflpv simulate cornell --method holpv --component bounce1 \\
+        difflpv simulate cornell --method holpv --component bounce1 --lights bundled --light 0 \\
             --receivers out/targets/light_0.npz --out out/prediction.npz
         """,
     )
@@ -90,20 +91,22 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"--out: expected a file name ending in .npz, got {args.out}")
     scene = load_scene(args.scene)
     table = load_receivers(args.receivers)
+    if args.out.exists() and args.out.samefile(args.receivers):
+        raise UsageError(f"--out: {args.out} is the table of --receivers and would be lost; choose another file")
     has_weight = "area_weight" in load_table(args.receivers)
     solve = solve_from(args, scene)
     check_floor(args, solve)
-    prediction = _predict(args, scene, solve, table)
-    warnings = [*scene.warnings, *prediction.warnings]
+    prediction, lit = _predict(args, scene, solve, table)
+    unjudged = _unjudged(args, table, lit)
+    warnings = [*scene.warnings, *prediction.warnings, *unjudged]
     warn(warnings)
     columns: dict[str, Any] = {"position": table.position, "normal": table.normal, "irradiance": prediction.irradiance}
     if has_weight:
         columns["area_weight"] = table.area_weight
     if table.albedo is not None:
         columns["albedo"] = table.albedo
-    make_folder("--out", args.out.parent)
     save_table(args.out, **columns)
-    scores = _scores(args, solve.label, table, prediction.irradiance)
+    scores = [] if unjudged else _scores(args, solve.label, table, prediction.irradiance)
     seconds = time.perf_counter() - started
     mean = np.average(prediction.irradiance, axis=0, weights=table.area_weight)
     if args.json:
@@ -130,20 +133,25 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _predict(args: argparse.Namespace, scene: Scene, solve: Solve, table: ReceiverTable) -> Prediction:
+def _predict(
+    args: argparse.Namespace, scene: Scene, solve: Solve, table: ReceiverTable
+) -> tuple[Prediction, Scene | None]:
+    """The prediction, and the scene under the lights that it was solved for; None for the constant, which solves nothing."""
     from difflpv.illumination import illuminate
     from difflpv.simulate import Prediction, simulate
 
     if solve.method == "constant":
         mean = constant_irradiance(args, scene, args.component)
-        return Prediction(np.broadcast_to(mean, table.position.shape).copy())
+        make_folder_of("--out", args.out)
+        return Prediction(np.broadcast_to(mean, table.position.shape).copy()), None
     check_targets(args, solve)
     device = select_device(args.device)
     lit = chosen_light(args, scene)
+    make_folder_of("--out", args.out)
     if solve.method == "floor":
         light = illuminate(lit, solve.grid, solve.config, args.component, seed=args.seed, device=device)
-        return floor_of(args, light, table.position, table.normal)
-    return simulate(
+        return floor_of(args, light, table.position, table.normal), lit
+    prediction = simulate(
         lit,
         table.position,
         table.normal,
@@ -153,6 +161,7 @@ def _predict(args: argparse.Namespace, scene: Scene, solve: Solve, table: Receiv
         seed=args.seed,
         device=device,
     )
+    return prediction, lit
 
 
 def constant_irradiance(args: argparse.Namespace, scene: Scene, component: str) -> np.ndarray:
@@ -175,13 +184,35 @@ def constant_irradiance(args: argparse.Namespace, scene: Scene, component: str) 
     return predict_constant(light.irradiance[component], light.area_weight)[0]
 
 
+def _unjudged(args: argparse.Namespace, table: ReceiverTable, lit: Scene | None) -> list[str]:
+    """Why the truth that the table holds tells no error of this prediction, in a line; nothing where it does, or has none."""
+    from data_gen.load import light_of_table
+
+    name = f"irr_{args.component}"
+    truth = table.extras.get(name)
+    if truth is None:
+        return []
+    made_under = light_of_table(args.receivers)
+    if lit is not None and made_under not in (None, lit.hash):
+        return [
+            f"{args.receivers}: the truth under another scene or light set than those of this solve, no error is told; name "
+            "the light set with --lights and --light, or use 'difflpv evaluate'"
+        ]
+    if truth.shape != table.position.shape:
+        shapes = f"expected shape {list(table.position.shape)}, got {list(truth.shape)}"
+        return [f"{args.receivers}: {name}: {shapes}, no error is told"]
+    if not np.isfinite(truth).all():
+        return [f"{args.receivers}: {name}: row {int(np.argmin(np.isfinite(truth).all(1)))} is not finite, no error is told"]
+    return [] if np.any(truth) else [f"{args.receivers}: {name} is 0 everywhere, no relative error is told"]
+
+
 def _scores(args: argparse.Namespace, label: str, table: ReceiverTable, irradiance: np.ndarray) -> list[Score]:
     """The prediction's score and the constant's, where the table holds the truth."""
     from difflpv.evaluate import predict_constant, score
 
     component, light = args.component, args.light or 0
     truth = table.extras.get(f"irr_{component}")
-    if truth is None or truth.shape != irradiance.shape or not np.any(truth) or not np.isfinite(truth).all():
+    if truth is None:
         return []
     weight = table.area_weight
     assert weight is not None

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from difflpv.cli.options import UsageError, add_command, add_output, positive
-from difflpv.cli.output import print_json, warn
+from difflpv.cli.output import make_folder_of, print_json, warn
 from difflpv.cli.probes.judged import CONTENTS, PlacedProbes, judging
 
 __all__ = ["add_parser", "run"]
@@ -57,6 +57,8 @@ def run(args: argparse.Namespace) -> int:
     scene = load_scene(args.scene)
     warn(scene.warnings)
     placed = PlacedProbes.of(args.probes, scene)
+    held_out = None if args.targets is None else judging(scene, args.targets, args.placed_by)
+    make_folder_of("--out", args.out)
     x = placed.position
     tetrahedra = Tetrahedra.of(x)
     cells = tetrahedra.vertices if len(tetrahedra.vertices) else tetrahedra.hull
@@ -76,11 +78,10 @@ def run(args: argparse.Namespace) -> int:
     edges = None if args.no_edges or placed.reader.interpolation != "tetrahedra" else x[tetrahedra.edges]
     pictures = [probe_picture(scene, placed.record.probes, edges=edges)]
     titles = [f"{scene.name}: {len(x)} probes{f', {placed.record.method}' if placed.record.method else ''}"]
-    if args.targets is not None:
+    if held_out is not None:
         from difflpv.placement.judge import judge, point_errors
         from difflpv.report.probe_errors import error_picture
 
-        held_out = judging(scene, args.targets, args.placed_by)
         content = placed.content(held_out, args.content, workers=args.workers)
         error = point_errors(held_out.judge, x, placed.reader, content)
         whole = judge(held_out.judge, x, placed.reader, content, timed=False)
