@@ -79,6 +79,8 @@ def test_errors_are_those_of_evaluate(room, tmp_path, capsys):
     ("options", "message"),
     [
         (("--png", "view.jpg"), "--png: expected a file name ending in .png, got view.jpg"),
+        (("--host", "nowhere.invalid"), "--host nowhere.invalid: cannot listen there: "),
+        (("--host", "192.0.2.1"), "--host 192.0.2.1: cannot listen there: Cannot assign requested address"),
         (("--port", 70000), "--port: expected at most 65535, got 70000"),
         (("--png", "v.png", "--height", 9), "--height: expected a place within the grid, -1.5..1.7 m, got 9"),
         (("--png", "v.png", "--step", 6), "--step: expected at most the 5 steps of the solve, got 6"),

@@ -25,7 +25,7 @@ from difflpv.cli.options import (
     select_device,
     usage_errors,
 )
-from difflpv.cli.output import make_folder, print_json, warn
+from difflpv.cli.output import make_folder_of, print_json, warn
 from difflpv.cli.solve import add_solve, describe_solve, solve_from
 
 if TYPE_CHECKING:
@@ -103,6 +103,7 @@ def run(args: argparse.Namespace) -> int:
         from difflpv.viewer.page import require_viser
 
         require_viser()
+        _check_host(args)
     scene = load_scene(args.scene)
     solve = solve_from(args, scene)
     lit, truth = _lit(args, scene)
@@ -133,12 +134,23 @@ def run(args: argparse.Namespace) -> int:
     if args.png is not None:
         from difflpv.viewer.still import draw_still
 
-        make_folder("--png", args.png.parent)
+        make_folder_of("--png", args.png)
         solved = state.solve(Knobs.neutral(lit))
         write_bytes(args.png, draw_still(state, solved, look, probes))
         _tell(args, f"{scene.name}: {describe_solve(solve)}\n-> {args.png}", png=args.png, relative_l2=solved.relative_l2)
         return 0
     return _serve(args, state, probes, look, f"{scene.name}: {describe_solve(solve)}")
+
+
+def _check_host(args: argparse.Namespace) -> None:
+    """A ``UsageError`` for a host that is none of this machine's: the server would wait for it without end."""
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(args.host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as tried:
+            tried.bind(address)
+    except (OSError, UnicodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise UsageError(f"--host {args.host}: cannot listen there: {reason}") from None
 
 
 def _serve(args: argparse.Namespace, state: Any, probes: ProbeView, look: Any, headline: str) -> int:
@@ -201,9 +213,11 @@ def _probes(args: argparse.Namespace, scene: Scene) -> ProbeView:
     if args.probes is not None and args.probe_grid is not None:
         raise UsageError("--probe-grid: --probes already says where the probes are")
     if args.probes is not None:
+        from difflpv.cli.probes.judged import check_scene
         from difflpv.probes.probe_files import load_probes
 
         record = load_probes(args.probes)
+        check_scene(args.probes, record, scene)
         return ProbeView.of(record.probes, interpolation=record.reader.interpolation)
     if args.probe_grid is None:
         return ProbeView.of(np.zeros((0, 3)))

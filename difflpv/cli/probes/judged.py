@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from difflpv.probes.reader import ProbeReader
     from difflpv.scene import Scene
 
-__all__ = ["CONTENTS", "PlacedProbes", "judging"]
+__all__ = ["CONTENTS", "PlacedProbes", "check_scene", "judging"]
 
 # As difflpv.placement.held_out.BAKED_CONTENTS, which would load torch; a test holds the two together.
 CONTENTS = ("fitted", "traced")
@@ -44,8 +44,7 @@ class PlacedProbes:
         from difflpv.probes.probe_files import load_probes
 
         record = load_probes(folder)
-        if record.scene and record.scene["hash"] != scene.hash:
-            raise UsageError(f"{folder}: probes of scene '{record.scene['name']}', not of this '{scene.name}'")
+        check_scene(folder, record, scene)
         if not len(record.probes.usable):
             raise UsageError(f"{folder}: none of its {len(record.probes)} probes is valid")
         return cls(folder, record, np.array(record.probes.usable.position), record.usable_reader)
@@ -68,3 +67,9 @@ def judging(scene: Scene, targets: Path, placed_by: Path | None) -> HeldOut:
     from difflpv.placement.held_out import HeldOut
 
     return HeldOut.of(scene, load_probe_targets(targets), None if placed_by is None else load_probe_targets(placed_by))
+
+
+def check_scene(folder: Path, record: ProbeRecord, scene: Scene) -> None:
+    """A ``UsageError`` for probes that were placed in another scene."""
+    if record.scene and record.scene["hash"] != scene.hash:
+        raise UsageError(f"{folder}: probes of scene '{record.scene['name']}', not of this '{scene.name}'")
