@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, fields
+from numbers import Real
 from typing import Any, Literal, get_args
 
 from difflpv.grid import Grid
@@ -99,8 +100,8 @@ class LpvConfig:
         for name in ("clamp", "occlude_first_step"):
             if not isinstance(getattr(self, name), bool):
                 raise ValueError(f"{name}: expected true or false, got {getattr(self, name)!r}")
-        if not self.tolerance >= 0:
-            raise ValueError(f"tolerance: expected a number >= 0, got {self.tolerance}")
+        if not (isinstance(self.tolerance, Real) and self.tolerance >= 0):
+            raise ValueError(f"tolerance: expected a number >= 0, got {self.tolerance!r}")
         self._check_probes()
         if learned:
             object.__setattr__(self, "clamp", False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 
 __all__ = ["Grid"]
 
+_MOST_CELLS = 2**31 - 1  # kernels count them in 32 bits
 _OFF_CENTER = 1e-3 * np.array([0.618, 0.382, 0.854])
 
 
@@ -37,6 +39,8 @@ class Grid:
             raise ValueError(f"grid cell_size: expected a positive length, got {self.cell_size}")
         if len(self.resolution) != 3 or min(self.resolution) < 1:
             raise ValueError(f"grid resolution: expected three positive integers, got {self.resolution}")
+        if math.prod(self.resolution) > _MOST_CELLS:
+            raise ValueError(f"grid resolution: expected at most {_MOST_CELLS} cells in all, got {self.resolution}")
 
     @classmethod
     def from_bounds(cls, minimum: Any, maximum: Any, resolution: Any) -> Grid:

@@ -32,7 +32,7 @@ def test_index_lists(text, expected):
     assert options.index_list(text) == expected
 
 
-@pytest.mark.parametrize("text", ["", "a", "1-", "-1", "4-2", "1,,2", "1 2", "1.5", "1,1", "0-3,2", "9" * 12])
+@pytest.mark.parametrize("text", ["", "a", "1-", "-1", "4-2", "1,,2", "1 2", "1.5", "1,1", "0-3,2", "9" * 12, "²"])
 def test_bad_index_lists(text):
     with pytest.raises(argparse.ArgumentTypeError):
         options.index_list(text)

@@ -96,6 +96,9 @@ def test_expected_failures_and_their_codes():
     assert describe_failure(WorkerError("died")).code == 1
     assert describe_failure(FloatingPointError("irradiance is not finite")).code == 1
     assert describe_failure(PermissionError(13, "Permission denied", "/x")).line == "/x: Permission denied"
+    full = "can't allocate memory: you tried to allocate 8 bytes"
+    for error in (RuntimeError(f"[enforce fail at x.cpp:127] err == 0. DefaultCPUAllocator: {full}"), MemoryError(full)):
+        assert (describe_failure(error).line, describe_failure(error).code) == (f"not enough memory: {full}", 1)
     for bug in (ValueError("x"), TypeError("x"), OSError("x"), RuntimeError("x")):
         assert describe_failure(bug) is None
 

@@ -33,6 +33,7 @@ def test_defaults_are_the_publications():
         ({"occlude_first_step": 1}, "occlude_first_step: expected true or false, got 1"),
         ({"tolerance": -0.1}, "tolerance: expected a number >= 0, got -0.1"),
         ({"tolerance": float("nan")}, "tolerance: expected a number >= 0, got nan"),
+        ({"tolerance": "0"}, "tolerance: expected a number >= 0, got '0'"),
         ({"l_max": 4}, "l_max"),
     ],
 )

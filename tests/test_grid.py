@@ -55,6 +55,7 @@ def test_with_cells():
         (lambda: Grid((0, 0, np.nan), 1.0, (2, 2, 2)), "grid minimum"),
         (lambda: Grid((0, 0, 0), 0.0, (2, 2, 2)), "grid cell_size: expected a positive length, got 0.0"),
         (lambda: Grid((0, 0, 0), 1.0, (2, 0, 2)), "grid resolution: expected three positive integers"),
+        (lambda: Grid((0, 0, 0), 1.0, (2**11, 2**10, 2**10)), "grid resolution: expected at most 2147483647 cells in all, got"),
         (lambda: Grid.from_bounds((0, 0, 0), (1, 2, 1), 4), "expected cubic cells, got"),
         (lambda: Grid.from_bounds((0, 0, 0), (1, -1, 1), 4), "expected cubic cells"),
         (lambda: Grid.from_bounds((0, 0, 0), (1, 1, 1), 0), "grid resolution: expected positive integers, got 0"),

@@ -452,11 +452,14 @@ def test_every_truncation_is_reported(tmp_path):
 
 
 def test_file_errors(tmp_path):
+    folder = tmp_path / "room.glb"
+    folder.mkdir()
     for source, expected in [
         (tmp_path / "none.glb", "none.glb: no such file"),
         ("cornel", "scene 'cornel': no such bundled scene, there are atrium, bunny, cornell"),
         ("scene.fbx", "unknown scene format '.fbx'"),
-        (tmp_path, "unknown scene format ''"),
+        (tmp_path, "expected a scene file (.glb, .gltf, .obj, .ply) or a bundled name, got a folder"),
+        (folder, "room.glb: expected a file, got a folder"),
     ]:
         with pytest.raises(SceneError) as info:
             load_scene(source)

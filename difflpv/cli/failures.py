@@ -27,6 +27,8 @@ _LAZY = {
     "difflpv.optim.checkpoint": ("CheckpointError", _BAD_INPUT),
 }
 
+_NO_MEMORY = ("can't allocate memory", "out of memory", "Failed to allocate")  # torch on the CPU and on CUDA, Warp
+
 
 @dataclass(frozen=True)
 class Failure:
@@ -44,6 +46,8 @@ def describe_failure(error: Exception) -> Failure | None:
     for module, (name, code) in _LAZY.items():
         if module in sys.modules and isinstance(error, getattr(sys.modules[module], name)):
             return Failure(line, code)
+    if isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and any(said in line for said in _NO_MEMORY)):
+        return Failure(f"not enough memory: {line.rpartition('Allocator: ')[2] or 'no more to be had'}", FAILED)
     if isinstance(error, FloatingPointError):  # a solve says which value made it overflow
         return Failure(line, FAILED)
     if isinstance(error, OSError) and error.filename is not None:

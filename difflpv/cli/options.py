@@ -160,7 +160,8 @@ def index_list(text: str) -> tuple[int, ...]:
     found: list[int] = []
     for part in text.split(","):
         first, dash, last = part.partition("-")
-        if not first.isdigit() or (dash and not last.isdigit()) or len(part) > 9 or int(last or first) < int(first):
+        numbers = part.isascii() and first.isdigit() and (last.isdigit() if dash else True) and len(part) <= 9
+        if not numbers or int(last or first) < int(first):
             raise argparse.ArgumentTypeError(f"expected numbers and ranges such as 0-4,7 (or none), got '{text}'")
         found += range(int(first), int(last or first) + 1)
     if len(set(found)) != len(found):

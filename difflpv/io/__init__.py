@@ -39,12 +39,15 @@ def load_scene(source: str | Path) -> Scene:
     if path.suffix.lower() not in SCENE_SUFFIXES:
         if text in bundled_scenes():
             path = _bundled_folder() / f"{text}.glb"
+        elif path.is_dir():
+            expected = f"a scene file ({', '.join(SCENE_SUFFIXES)}) or a bundled name"
+            raise SceneError(f"{path}: expected {expected}, got a folder")
         elif not path.suffix and not path.exists():
             raise SceneError(f"scene '{text}': no such bundled scene, there are {', '.join(bundled_scenes())}")
         else:
             raise SceneError(f"{text}: unknown scene format '{path.suffix}', expected {', '.join(SCENE_SUFFIXES)}")
     if not path.is_file():
-        raise SceneError(f"{path}: no such file")
+        raise SceneError(f"{path}: {'expected a file, got a folder' if path.is_dir() else 'no such file'}")
     try:
         return _load(path)
     except SceneError as error:
