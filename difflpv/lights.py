@@ -26,7 +26,7 @@ from difflpv.scene import AreaLight, DirectionalLight, Light, Mesh, PointLight, 
 
 __all__ = ["LightEntry", "apply_light_set", "behind_light_weight", "load_light_sets", "select_light_set"]
 
-_PANEL_GAP = 0.05  # m behind a panel in which no volume can resolve the light
+_PANEL_GAP, _PANEL_SHARE = 0.05, 0.01  # m, and share of the scene, behind a panel in which no volume can resolve the light
 _FIELDS: dict[str, tuple[dict[str, int], dict[str, int]]] = {  # type: (required, optional) fields and their lengths
     "area": ({"mesh": 0, "radiance": 3}, {"one_sided": 0, "vertices": 0}),
     "point": ({"position": 3, "intensity": 3}, {"name": 0}),
@@ -179,7 +179,7 @@ def _check_numbers(value: Any, length: int, where: str) -> None:
             raise SceneError(f"{where}: expected finite numbers, got {str(value)[:60]}")
 
 
-def behind_light_weight(scene: Scene, positions: np.ndarray, *, gap: float = _PANEL_GAP) -> np.ndarray:
+def behind_light_weight(scene: Scene, positions: np.ndarray, *, gap: float | None = None) -> np.ndarray:
     """Receivers in the gap behind a light's panel, which get area weight 0.
 
     No volume can resolve light in the centimetres between a panel and the wall that it hangs on, and those receivers
@@ -188,12 +188,15 @@ def behind_light_weight(scene: Scene, positions: np.ndarray, *, gap: float = _PA
     Args:
         scene: the scene under the lights in question.
         positions: receiver positions [m], shape [n,3].
-        gap: how far behind a panel [m].
+        gap: how far behind a panel [m]; None for 0.05 m, in scenes of less than 5 m 0.01 of their longest edge.
 
     Returns:
         True for receivers that lie over a triangle of a one-sided area light, on the side that it does not emit to and
         closer than ``gap`` to its plane, shape [n] bool. Set their weight to 0.
     """
+    if gap is None:
+        low, high = scene.bounds
+        gap = min(_PANEL_GAP, _PANEL_SHARE * float((high - low).max()))
     positions = np.asarray(positions, np.float64)
     if positions.ndim != 2 or positions.shape[1] != 3:
         raise ValueError(f"positions: expected shape [n, 3], got {list(positions.shape)}")

@@ -120,6 +120,8 @@ def test_default_camera_of_a_room_stands_inside_and_of_an_object_outside(tmp_pat
     assert np.linalg.norm(position) > 1.5
     _, direction = ball.cameras[0].rays(np.array([[128.0, 96.0]]))
     np.testing.assert_allclose(direction[0], -position / np.linalg.norm(position), atol=1e-9)
+    sheet = scene_of(trimesh.Trimesh([[0, 0, 0], [0, 0, 2], [2, 0, 0]], [[0, 1, 2]]), False)
+    assert sheet.cameras[0].to_world[1, 3] > 0.5
 
 
 HOSTILE = ["nan", "inf", "-1", "0", "99999999999", "1e999", "", "/", "1//", "f", "v", "\0", "\\", "mtllib", "map_Kd"]

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -139,6 +140,10 @@ def test_receivers_behind_the_panel_by_hand(cornell):
         (-0.01, 1.01, 1): False,  # beside it
     }
     np.testing.assert_array_equal(behind_light_weight(lit, np.array(list(points))), list(points.values()))
+    # The gap shrinks with a small scene: its ceiling is not all behind the lamp.
+    small = replace(lit, meshes=tuple(replace(m, vertices=m.vertices / 100) for m in lit.meshes))
+    near = behind_light_weight(small, np.array([[0.01, 0.0101, 0.01], [0.01, 0.0109, 0.01]]))
+    assert list(near) == [True, False]
     both = apply_light_set(cornell, [square | {"one_sided": False}])
     assert not behind_light_weight(both, np.array(list(points))).any()
     with pytest.raises(ValueError, match=r"positions: expected shape \[n, 3\], got \[3\]"):

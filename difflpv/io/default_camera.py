@@ -16,7 +16,8 @@ def default_camera(scene: Scene) -> Camera:
     """Camera that looks at the middle of the scene's bounds.
 
     A room is looked at from inside, from the candidate with the freest view; an object from outside. A scene counts
-    as a room if it blocks the view into its bounds right where most of the outside candidates' rays enter them.
+    as a room if it blocks the view into its bounds right where most of the outside candidates' rays enter them; a flat
+    one never does.
     """
     low, high = scene.bounds
     middle, half = (low + high) / 2, np.maximum((high - low) / 2, 1e-6 * float((high - low).max()) + 1e-12)
@@ -29,7 +30,8 @@ def default_camera(scene: Scene) -> Camera:
     distance = np.linalg.norm(outside - middle, axis=1)
     entry = distance - np.min(half / np.abs(directions), axis=1)
     hit = rays.closest(outside, -directions).distance
-    if (hit > entry + 0.1 * radius).sum() >= 2:
+    sheet = half.min() < 1e-3 * half.max()  # has no inside to look from
+    if sheet or (hit > entry + 0.1 * radius).sum() >= 2:
         return _look_at(outside[int(np.argmax(hit - entry))], middle)
 
     angles = np.arange(16) * np.pi / 8
