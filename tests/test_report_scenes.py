@@ -1,5 +1,8 @@
 """Figures of scenes: what is where in them, and how large."""
 
+import io
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -8,8 +11,8 @@ from difflpv.grid import Grid
 from difflpv.io import load_scene
 from difflpv.probes.probe_set import ProbeSet
 from difflpv.report.picture import axis_camera, picture
-from difflpv.report.scene_figures import LobeSlice, lobe_picture, probe_figure, probe_picture
-from difflpv.scene import Camera
+from difflpv.report.scene_figures import LobeSlice, draw_pictures, lobe_picture, probe_figure, probe_picture
+from difflpv.scene import Camera, DirectionalLight
 from difflpv.sh import cosine_lobe
 from difflpv.shapes.overview import outside_camera
 from difflpv.shapes.shape import Shape
@@ -89,6 +92,26 @@ def test_a_slice_points_where_its_light_goes():
     y, x = np.argwhere(changed).T
     assert x.mean() > 100 + 10 and abs(y.mean() - changed.shape[0] / 2) < 3
     assert plain.min() < 0.05, "the walls are outlined"
+
+
+def test_a_slice_of_a_flat_scene_is_more_than_a_line():
+    scene = load_scene("cornell")
+    sun = DirectionalLight(np.array([0.0, -1, 0]), np.ones(3))
+    flat = replace(scene, meshes=tuple(m for m in scene.meshes if m.name == "floor"), lights=(sun,))
+    layer = LobeSlice(np.zeros((0, 3)), np.zeros((0, 9, 3)), Grid((-3, -0.25, -3), 2.0, (3, 3, 3)), 2, 0.0)
+    height, width, _ = lobe_picture(flat, layer, width=200).shape
+    assert height > 0.3 * width
+
+
+def test_titles_have_room_over_narrow_pictures():
+    def inked(*titles):
+        """Columns of pixels that the titles fill."""
+        images = [np.zeros((400, 1200, 3)), *[np.zeros((400, 100, 3))] * (len(titles) - 1)]
+        with Image.open(io.BytesIO(draw_pictures(images, titles))) as shown:
+            return int((np.asarray(shown.convert("L"))[:22] < 200).any(0).sum())
+
+    title = "moves after 4 steps, z = 0.667 m"
+    assert inked("a", title, title) == pytest.approx(inked("a") + 2 * inked(title), rel=0.05), "no title covers another"
 
 
 @pytest.mark.parametrize("name", ["two_rooms_90", "planter"])

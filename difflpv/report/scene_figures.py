@@ -31,6 +31,8 @@ _WIDTH = 3.7  # of a picture [inches]
 _WALL, _EDGE = (0.03, 0.03, 0.03), (0.05, 0.22, 0.45)
 _INVALID = 0.02
 _LARGEST_PROBE = 0.03  # of the scene's extent
+_LEAST_SHARE = 0.4  # of the longest edge that any edge of a slice shows
+_TITLE = 0.088  # of a letter [inches]
 _GREY = (0.50, 0.51, 0.53)
 
 
@@ -111,23 +113,25 @@ def lobe_picture(scene: Scene, layer: LobeSlice, *, reference: float | None = No
     ``reference`` is the largest value that stands for the longest lobe (``difflpv.shapes.lobes.lobe_shape``).
     """
     low, high = scene.bounds
-    cell = layer.grid.cell_size
-    margin = 0.04 * float((high - low).max())
+    cell, extent = layer.grid.cell_size, float((high - low).max())
+    margin = np.maximum(0.04 * extent, (_LEAST_SHARE * extent - (high - low)) / 2)  # a flat scene is more than a line
     lobes = lobe_shape(layer.centers, layer.coeffs, 1.1 * cell, reference=reference)
-    walls = tube_shape(section(scene.triangle_vertices, layer.axis, layer.height), 0.004 * float((high - low).max()), _WALL)
+    walls = tube_shape(section(scene.triangle_vertices, layer.axis, layer.height), 0.004 * extent, _WALL)
     camera = axis_camera(low - margin, high + margin, layer.axis, layer.height)
     return picture(joined([lobes, walls]), camera, width=width, background=_GREY)
 
 
 def draw_pictures(images: Sequence[np.ndarray], titles: Sequence[str]) -> bytes:
-    """Linear pictures [H,W,3] side by side at one height under their titles, as a PNG."""
+    """Linear pictures [H,W,3] side by side at one height under their titles, as a PNG; a narrow one has room for its title."""
     aspects = [image.shape[1] / image.shape[0] for image in images]
     height = _WIDTH / (sum(aspects) / len(aspects))
-    figure = new_figure(height * sum(aspects) + 0.1 * len(images), height + 0.35, dpi=DPI)
-    axes = figure.subplots(1, len(images), squeeze=False, width_ratios=aspects)[0]
+    widths = [max(height * aspect, _TITLE * len(title)) for aspect, title in zip(aspects, titles, strict=True)]
+    figure = new_figure(sum(widths) + 0.1 * len(images), height + 0.35, dpi=DPI)
+    axes = figure.subplots(1, len(images), squeeze=False, width_ratios=widths)[0]
     for axis, image, title in zip(axes, images, titles, strict=True):
         axis.imshow(linear_to_srgb(image), interpolation="lanczos")
         axis.set(xticks=[], yticks=[])
         axis.spines[:].set_visible(False)
+        axis.set_anchor("W")
         title_axis(axis, title)
     return png_bytes(figure)

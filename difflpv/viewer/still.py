@@ -47,7 +47,7 @@ def draw_still(state: ViewState, solved: Solved, look: Look, probes: ProbeView) 
         [lit, lobes(look.step, "moving"), lobes(state.steps, "sum")],
         [
             state.scene.name + (f", {count} probes" if count else ""),
-            f"moves after {look.step} steps, {look.axis} = {height:.2f} m",
+            f"moves after {look.step} steps, {look.axis} = {height:.3g} m",
             f"sum after {state.steps} steps",
         ],
     )
