@@ -78,6 +78,17 @@ def test_only_what_is_near_the_answer_is_judged_closely():
     assert "Half the tolerance, 0.25: dearer rungs were not judged" in text
 
 
+def test_times_that_are_alike_foretell_nothing():
+    """A hundredth more time and half the error: to the power -70 nothing is said."""
+    rungs = rungs_of(2)
+    errors, seconds = {"rung 0": 0.5, "rung 1": 0.25}, {"rung 0": 1.0, "rung 1": 1.01}
+    text = explain(plan_with(KnownJudge(errors, seconds), rungs, tolerance=0.3))
+    assert text.endswith("Half the tolerance, 0.15: nothing on the ladder reached it")
+    seconds["rung 1"] = 2.0
+    text = " ".join(explain(plan_with(KnownJudge(errors, seconds), rungs, tolerance=0.3)).split())
+    assert "(error as time to the power -1.00)" in text
+
+
 def test_an_interruption_keeps_what_is_known():
     class Impatient(KnownJudge):
         def judge(self, rung, level):

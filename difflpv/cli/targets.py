@@ -55,7 +55,7 @@ def add_parser(subparsers: Any) -> None:
         help="direct, bounce1, uptoK, full, full_indirect (default: direct bounce1 full)",
     )
     goal = parser.add_mutually_exclusive_group()
-    goal.add_argument("--spp", type=positive, metavar="N", help="paths per receiver")
+    goal.add_argument("--spp", type=positive, metavar="N", help="paths per receiver, rounded up: 32, 64, ..., multiples of 512")
     goal.add_argument(
         "--target-error", type=fraction, metavar="SHARE", help="go on to this standard error over mean (default: 0.01)"
     )

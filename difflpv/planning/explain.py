@@ -12,6 +12,7 @@ from difflpv.planning.race import Runner
 __all__ = ["bought_table", "explain", "half_tolerance", "left_out"]
 
 _WIDTH = 100
+_LONGER = 1.25  # times that differ by less are alike
 _FAR = 100.0  # times the time: nothing that was measured foretells so far
 
 _STATES = {
@@ -123,8 +124,10 @@ def half_tolerance(plan: Plan) -> str:
         return hope
     first, last = front[0], front[-1]
     assert first.estimate and last.estimate and first.seconds and last.seconds
+    if last.seconds < _LONGER * first.seconds:  # tells nothing of what more time buys
+        return hope
     fall = math.log(first.estimate.error / max(last.estimate.error, 1e-12))
-    power = fall / math.log(last.seconds / first.seconds) if last.seconds > first.seconds else 0.0
+    power = fall / math.log(last.seconds / first.seconds)
     far = math.log(last.estimate.error / half) >= power * math.log(_FAR)
     if power <= 0 or far:
         return _filled(f"{hope}; going by the table, not even {_FAR:g} times the time would reach it")

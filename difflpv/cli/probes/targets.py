@@ -47,7 +47,9 @@ def add_parser(subparsers: Any) -> None:
         "--component", default="bounce1", metavar="NAME",
         help="direct, bounce1, uptoK, full, full_indirect (default: %(default)s)",
     )  # fmt: skip
-    parser.add_argument("--spp", type=positive, default=1024, metavar="N", help="paths per point (default: %(default)s)")
+    parser.add_argument("--spp", type=positive, default=1024, metavar="N",
+        help="paths per point, rounded up as those of 'difflpv targets' (default: %(default)s)",
+    )
     parser.add_argument("--lattice-spp", type=positive, default=256, metavar="N", help="paths per cell (default: %(default)s)")
     parser.add_argument(
         "--lights", default="own", metavar="LIGHTS",
