@@ -22,7 +22,7 @@ from data_gen.estimators import REPLICATES
 from data_gen.freespace import default_clearance, draw_probes, is_free
 from data_gen.load import FORMAT, TargetsError, check_files, check_made_for
 from data_gen.receivers import draw_receivers
-from data_gen.request import check_counts, find_finished, finish, make_folder, relit, request_digest
+from data_gen.request import alone_in, check_counts, find_finished, finish, make_folder, relit, request_digest
 from data_gen.rng import generator
 from data_gen.run import JobRun
 from data_gen.targets import MAX_SPP
@@ -181,55 +181,59 @@ def make_probe_targets(
     if not free.any():
         raise TargetsError(f"probe targets: scene '{scene.name}': no cell of {grid.cell_size:.3g} m is free, take more cells")
     make_folder(out)
-    samples, rounds = round_samples(spp)
-    cell_samples, cell_rounds = round_samples(lattice_spp)
-    job = Job(
-        scenes=lit_scenes,
-        parts={
-            "probes": JobPart(wanted, len(points), samples),
-            "lattice": JobPart(wanted, int(free.sum()), cell_samples),
-        },
-        seed=seed,
-        positions=np.empty((0, 3)),
-        normals=np.empty((0, 3)),
-        probes=points,
-        lattice=grid.cell_centers()[free],
-    )
-    store = BlockStore(out / f".blocks-{request_digest(request)[:16]}")
-    with BlockRunner(job, store, workers=workers, progress=progress) as runner:
-        run = JobRun(runner)
-        run.compute("probes", [rounds] * len(lit_scenes))
-        run.compute("lattice", [cell_rounds] * len(lit_scenes))
-    radiance, spread = np.empty((2, len(lit_scenes), len(points), 9, 3), np.float32)
-    lattice = np.zeros((len(lit_scenes), *grid.shape, 9, 3), np.float32)
-    summary: list[dict[str, Any]] = []
-    for light, lit in enumerate(lit_scenes):
-        at_points = _estimate(run, light, "probes", rounds)
-        at_cells = _estimate(run, light, "lattice", cell_rounds)
-        radiance[light], spread[light], lattice[light, free] = at_points.mean, at_points.standard_error, at_cells.mean
-        summary.append(
-            {
-                "hash": lit.hash,
-                "entries": entries[light],
-                "spp": rounds * REPLICATES * samples,
-                "lattice_spp": cell_rounds * REPLICATES * cell_samples,
-                "noise": {"points": _noise(at_points), "lattice": _noise(at_cells)},
-            }
+    with alone_in(out):
+        finished = find_finished(out, request, overwrite, load_probe_targets, _KIND)  # by another process meanwhile
+        if finished is not None:
+            return finished
+        samples, rounds = round_samples(spp)
+        cell_samples, cell_rounds = round_samples(lattice_spp)
+        job = Job(
+            scenes=lit_scenes,
+            parts={
+                "probes": JobPart(wanted, len(points), samples),
+                "lattice": JobPart(wanted, int(free.sum()), cell_samples),
+            },
+            seed=seed,
+            positions=np.empty((0, 3)),
+            normals=np.empty((0, 3)),
+            probes=points,
+            lattice=grid.cell_centers()[free],
         )
-    table = out / _TABLE
-    save_table(
-        table,
-        points=points,
-        surface_count=surface_count,
-        radiance=radiance,
-        standard_error=spread,
-        grid_minimum=grid.minimum,
-        cell_size=grid.cell_size,
-        lattice=lattice,
-        clearance=clearance,
-    )
-    finish(out, request, summary, [table], rays=run.rays, seconds=run.seconds, kind=_KIND)
-    return load_probe_targets(out)
+        store = BlockStore(out / f".blocks-{request_digest(request)[:16]}")
+        with BlockRunner(job, store, workers=workers, progress=progress) as runner:
+            run = JobRun(runner)
+            run.compute("probes", [rounds] * len(lit_scenes))
+            run.compute("lattice", [cell_rounds] * len(lit_scenes))
+        radiance, spread = np.empty((2, len(lit_scenes), len(points), 9, 3), np.float32)
+        lattice = np.zeros((len(lit_scenes), *grid.shape, 9, 3), np.float32)
+        summary: list[dict[str, Any]] = []
+        for light, lit in enumerate(lit_scenes):
+            at_points = _estimate(run, light, "probes", rounds)
+            at_cells = _estimate(run, light, "lattice", cell_rounds)
+            radiance[light], spread[light], lattice[light, free] = at_points.mean, at_points.standard_error, at_cells.mean
+            summary.append(
+                {
+                    "hash": lit.hash,
+                    "entries": entries[light],
+                    "spp": rounds * REPLICATES * samples,
+                    "lattice_spp": cell_rounds * REPLICATES * cell_samples,
+                    "noise": {"points": _noise(at_points), "lattice": _noise(at_cells)},
+                }
+            )
+        table = out / _TABLE
+        save_table(
+            table,
+            points=points,
+            surface_count=surface_count,
+            radiance=radiance,
+            standard_error=spread,
+            grid_minimum=grid.minimum,
+            cell_size=grid.cell_size,
+            lattice=lattice,
+            clearance=clearance,
+        )
+        finish(out, request, summary, [table], rays=run.rays, seconds=run.seconds, kind=_KIND)
+        return load_probe_targets(out)
 
 
 def load_probe_targets(folder: str | Path) -> ProbeTargets:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import platform
 import shutil
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from importlib import metadata
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,7 +21,13 @@ from difflpv.io.tables import ReceiverTable
 from difflpv.lights import apply_light_set
 from difflpv.scene import AreaLight, Camera, DirectionalLight, Scene, SpotLight
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
 __all__ = [
+    "alone_in",
     "check_counts",
     "describe_request",
     "find_finished",
@@ -120,6 +128,24 @@ def find_finished(
         f"{out}: holds targets of another request (different {', '.join(differing)}); "
         "choose another folder or overwrite them"
     )
+
+
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Waits until no other process makes targets in ``folder``: of two runs one makes them, the other finds them.
+
+    The lock ends with the process, however that ends. Where the system or the file system has none, nothing is waited for.
+    """
+    handle = None
+    if fcntl is not None:
+        with suppress(OSError):
+            handle = os.open(folder, os.O_RDONLY)
+            fcntl.flock(handle, fcntl.LOCK_EX)
+    try:
+        yield
+    finally:
+        if handle is not None:
+            os.close(handle)
 
 
 def make_folder(out: Path) -> None:

@@ -20,7 +20,7 @@ from data_gen.estimators import REPLICATES
 from data_gen.freespace import draw_probes
 from data_gen.load import Targets, TargetsError, load_targets
 from data_gen.receivers import draw_receivers
-from data_gen.request import check_counts, describe_request, find_finished, finish, make_folder, relit, request_digest
+from data_gen.request import alone_in, check_counts, describe_request, find_finished, finish, make_folder, relit, request_digest
 from data_gen.rng import MAX_SAMPLES
 from data_gen.run import TargetRun
 from difflpv.io.tables import ReceiverTable
@@ -116,42 +116,46 @@ def make_targets(
     if finished is not None:
         return finished
     make_folder(out)
-    if receivers is None:
-        receivers = draw_receivers(scene, receiver_count or 4000, seed)
-    samples, rounds = round_samples(spp if spp is not None else max_spp)
-    parts: dict[Quantity, JobPart] = {"surface": JobPart(wanted, len(receivers), samples)}
-    extra_rounds: dict[Quantity, int] = {}
-    if probes:
-        probe_samples, extra_rounds["probes"] = round_samples(probe_spp)
-        parts["probes"] = JobPart(Components.of(PROBE_COMPONENTS), probes, probe_samples)
-    if camera is not None:
-        image_samples, extra_rounds["image"] = round_samples(image_spp)
-        parts["image"] = JobPart(wanted, camera.width * camera.height, image_samples)
-    job = Job(
-        scenes=lit_scenes,
-        parts=parts,
-        seed=seed,
-        positions=receivers.position,
-        normals=receivers.normal / np.linalg.norm(receivers.normal, axis=1, keepdims=True),
-        probes=draw_probes(scene, probes, seed) if probes else np.empty((0, 3)),
-        camera=camera,
-    )
-    store = BlockStore(out / f".blocks-{request_digest(request)[:16]}")
-    with BlockRunner(job, store, workers=workers, progress=progress) as runner:
-        run = TargetRun(runner, receivers)
-        if spp is not None:
-            surface_rounds = [rounds] * len(lit_scenes)
-            run.compute("surface", surface_rounds)
-        else:
-            assert target_error is not None
-            surface_rounds = run.until(target_error, rounds)
-        for quantity, count in extra_rounds.items():
-            run.compute(quantity, [count] * len(lit_scenes))
-    files, summary = run.write(out, surface_rounds, extra_rounds)
-    for light, light_summary in enumerate(summary):
-        light_summary["entries"] = entries[light]
-    finish(out, request, summary, files, rays=run.rays, seconds=run.seconds)
-    return load_targets(out)
+    with alone_in(out):
+        finished = find_finished(out, request, overwrite, load_targets)  # by another process meanwhile
+        if finished is not None:
+            return finished
+        if receivers is None:
+            receivers = draw_receivers(scene, receiver_count or 4000, seed)
+        samples, rounds = round_samples(spp if spp is not None else max_spp)
+        parts: dict[Quantity, JobPart] = {"surface": JobPart(wanted, len(receivers), samples)}
+        extra_rounds: dict[Quantity, int] = {}
+        if probes:
+            probe_samples, extra_rounds["probes"] = round_samples(probe_spp)
+            parts["probes"] = JobPart(Components.of(PROBE_COMPONENTS), probes, probe_samples)
+        if camera is not None:
+            image_samples, extra_rounds["image"] = round_samples(image_spp)
+            parts["image"] = JobPart(wanted, camera.width * camera.height, image_samples)
+        job = Job(
+            scenes=lit_scenes,
+            parts=parts,
+            seed=seed,
+            positions=receivers.position,
+            normals=receivers.normal / np.linalg.norm(receivers.normal, axis=1, keepdims=True),
+            probes=draw_probes(scene, probes, seed) if probes else np.empty((0, 3)),
+            camera=camera,
+        )
+        store = BlockStore(out / f".blocks-{request_digest(request)[:16]}")
+        with BlockRunner(job, store, workers=workers, progress=progress) as runner:
+            run = TargetRun(runner, receivers)
+            if spp is not None:
+                surface_rounds = [rounds] * len(lit_scenes)
+                run.compute("surface", surface_rounds)
+            else:
+                assert target_error is not None
+                surface_rounds = run.until(target_error, rounds)
+            for quantity, count in extra_rounds.items():
+                run.compute(quantity, [count] * len(lit_scenes))
+        files, summary = run.write(out, surface_rounds, extra_rounds)
+        for light, light_summary in enumerate(summary):
+            light_summary["entries"] = entries[light]
+        finish(out, request, summary, files, rays=run.rays, seconds=run.seconds)
+        return load_targets(out)
 
 
 def _check_counts(spp, target_error, max_spp, probes, probe_spp, image_spp, seed, workers, receiver_count) -> None:

@@ -1,5 +1,8 @@
 """Targets for placing probes: closed forms, signs, equal bits, resume, recognition; and the task made of them."""
 
+import os
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +14,7 @@ from data_gen import blocks
 from data_gen.freespace import default_clearance, is_free
 from data_gen.load import TargetsError, load_targets
 from data_gen.probe_targets import load_probe_targets, make_probe_targets
+from data_gen.request import make_folder
 from difflpv.placement.from_targets import placement_task, split_points
 from difflpv.scene import AreaLight, DirectionalLight, PointLight, Scene
 from difflpv.sh import sh_basis
@@ -224,3 +228,29 @@ def test_task_refuses_what_does_not_fit(made):
     for share in (0, 1, 1e-9):
         with pytest.raises(ValueError, match="share"):
             split_points(made, share)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs flock")
+@pytest.mark.parametrize("seeds", [(5, 5), (5, 6)])
+def test_two_runs_at_once_in_one_folder_do_not_mix(seeds, tmp_path, monkeypatch):
+    """The second waits; it finds what the first made, or is told that another request is there."""
+    computed = []
+    monkeypatch.setattr(blocks, "compute_block", lambda *a, real=blocks.compute_block: (computed.append(a[2]), real(*a))[1])
+    tiny = {"count": 4, "cells": 3, "spp": 32, "lattice_spp": 32}
+    both_asked = threading.Barrier(2, timeout=60)
+    monkeypatch.setattr("data_gen.probe_targets.make_folder", lambda out: (make_folder(out), both_asked.wait()))
+
+    def run(seed):
+        try:
+            return make_probe_targets(block_room(), tmp_path, seed=seed, **tiny)
+        except TargetsError as error:
+            return str(error)
+
+    with ThreadPoolExecutor(2) as pool:
+        first, second = pool.map(run, seeds)
+    assert len(computed) == len(set(computed)) == 2
+    refused = [found for found in (first, second) if isinstance(found, str)]
+    if seeds[0] == seeds[1]:
+        assert not refused and np.array_equal(first.radiance, second.radiance)
+    else:
+        assert len(refused) == 1 and "holds targets of another request (different seed)" in refused[0]
