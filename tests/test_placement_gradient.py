@@ -182,11 +182,15 @@ def test_relocation_takes_a_redundant_probe_to_where_the_error_is(task):
     assert np.linalg.norm(more.position[11] - LIGHT) < 0.8 and (more.position[11:, 0] < WALL).all()
 
 
-def test_even_light_puts_no_two_probes_in_one_place():
-    """Where no error is left, new ones were spawned at the first point again and again."""
-    even = analytic_task(points=60, radiance=lambda x: np.ones((*x.shape[:-1], 9, 3)))
-    placement = place(even, 6, "gradient", steps=6)
-    assert len(np.unique(placement.position, axis=0)) == len(placement) == 6
+def test_no_probe_is_spawned_where_one_stands(task):
+    """Most error is where the field that they hold is far from the truth: more of them there would take none of it away."""
+    bright = task.radiance.clone()
+    bright[7] *= 1000
+    down = descent(replace(task, radiance=bright), content="field")
+    probes = Probes(task.points.numpy()[:1])
+    for _ in range(3):
+        probes = with_spawned(down, probes, 1)
+    assert len(np.unique(probes.position, axis=0)) == len(probes) == 4
 
 
 def test_interrupted_work_keeps_the_best_and_goes_on_to_the_same_bits(task, tmp_path, monkeypatch):
