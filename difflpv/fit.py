@@ -165,7 +165,7 @@ def fit(
             propagation factor lies beyond its critical value, the fit starts from that value and says so.
         checkpoint: file that the solver writes and resumes from.
         callback: called with every evaluation.
-        label: recognises a checkpoint of another fit.
+        label: recognises a checkpoint of another fit, beside loss, train lights and sparsity.
         **options: of the solver.
 
     Returns:
@@ -215,7 +215,8 @@ def fit(
                 parts.append((gap / torch.linalg.vector_norm(root * t.irradiance)).double().ravel())
             return torch.cat(parts)
 
-        return Problem(objective, lpv.described, backward_cost=_BACKWARD_COST, residual=residual, label=label)
+        made_of = f"{label}; loss {loss}, train {list(train)}, sparsity {sparsity:g}"
+        return Problem(objective, lpv.described, backward_cost=_BACKWARD_COST, residual=residual, label=made_of)
 
     lpv = Lpv(first.grid, config, learn=learn, scene=first.scene, initial=initial)
     moved, told = _start_within_the_limit(lpv, problem_of(lpv)), ""

@@ -216,11 +216,19 @@ class Illumination:
         return rsm_vpls(rsm, position=position, power=emitters.power[light], albedo=albedo)
 
     def receivers(self, position: np.ndarray | torch.Tensor, normal: np.ndarray | torch.Tensor) -> Receivers:
-        """Receivers [n,3], [n,3], with the rays that the direct part of punctual lights and the lookup need."""
+        """Receivers [n,3] m with unit normals [n,3], and the rays that direct light of punctual lights and the lookup need.
+
+        Raises:
+            ValueError: a wrong shape, a number that is not finite, or a normal that is no unit vector.
+        """
         like = self.emitters.position
         x, n = (torch.as_tensor(a, dtype=like.dtype, device=like.device).detach() for a in (position, normal))
         check_points("position", x)
         check_points("normal", n, count=len(x))
+        length = torch.linalg.vector_norm(n, dim=1)
+        if bool(((length - 1).abs() > 1e-3).any()):
+            worst = int((length - 1).abs().argmax())
+            raise ValueError(f"normal: expected unit length, got {float(length[worst]):.6g} in row {worst}")
         seen, rows, grids = None, None, self.config.grids(self.grid)
         reads: list[CellReads] = []
         boxes = [_box_around(x, grid) for grid in grids]

@@ -17,7 +17,7 @@ from difflpv.fitted import FittedError, FittedRecord, read_fitted, write_fitted
 from difflpv.grid import Grid
 from difflpv.illumination import Illumination, LightValues, Receivers
 from difflpv.injection import InjectionReport, inject
-from difflpv.learnables import describe_learnables, fixed_values
+from difflpv.learnables import LEARNABLES, describe_learnables, fixed_values
 from difflpv.lit_probes import probe_radiance
 from difflpv.parameters import Parameter
 from difflpv.probes.lookup import probe_irradiance
@@ -147,7 +147,8 @@ class Lpv(torch.nn.Module):
             Irradiance [n,3] W/m2, in the precision of ``illumination``. ``self.report`` tells what injection lost.
 
         Raises:
-            ValueError: an illumination made for another grid, or without the occlusion that the configuration names.
+            ValueError: an illumination made for another grid, or without the occlusion that the configuration names; a value of
+                no learnable.
             FloatingPointError: the result is not finite.
         """
         return self.gather(self.accumulate(illumination, values, receivers), illumination, receivers, values)
@@ -314,6 +315,9 @@ class Lpv(torch.nn.Module):
 
     def _merged(self, values: Mapping[str, torch.Tensor] | None) -> dict[str, torch.Tensor]:
         """Everything that a solve needs, as it is held: fixed, then learned, then given."""
+        for name in values or ():
+            if name not in LEARNABLES or (name == "stencil" and self._coordinates is None):
+                raise ValueError(f"values: expected names of learnables (a stencil's only where it is learned), got {name!r}")
         return {**self._fixed, **self.values(), **(values or {})}
 
     def _not_finite(self, values: Mapping[str, torch.Tensor]) -> str:

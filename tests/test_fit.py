@@ -13,6 +13,7 @@ from difflpv.fit import fit, light_target, score_lights
 from difflpv.grid import Grid
 from difflpv.illumination import illuminate
 from difflpv.loss import relative_l2
+from difflpv.optim.checkpoint import CheckpointError
 from difflpv.optim.result import Status
 from difflpv.pipeline import Lpv
 from difflpv.scene import AreaLight, Camera, Scene
@@ -199,6 +200,17 @@ def test_an_interrupted_fit_keeps_its_best_and_resumes_bit_for_bit(tmp_path, sol
     for name, value in whole.result.parameters.items():
         assert torch.equal(resumed.result.parameters[name], value)
     assert [p.loss for p in resumed.result.history] == [p.loss for p in whole.result.history]
+
+
+@pytest.mark.parametrize(("changed", "told"), [({"loss": "log"}, "loss log"), ({"sparsity": 0.5}, "sparsity 0.5")])
+def test_a_checkpoint_of_another_loss_is_refused(tmp_path, changed, told):
+    """Its best point would be the best of another loss."""
+    scene, targets = targets_of(CONFIG, {"propagation": 0.8})
+    options = {"config": CONFIG, "learn": ["cell_occlusion"], "train": [0], "test": [], "budget": 6, "label": "a"}
+    options["checkpoint"] = tmp_path / "c.pt"
+    fit(scene, targets, **options)
+    with pytest.raises(CheckpointError, match=f"belongs to another fit: label is .* there and .*{told}"):
+        fit(scene, targets, **options | changed)
 
 
 def test_a_fit_that_overflows_says_where():

@@ -42,6 +42,14 @@ def test_given_values_take_the_place_of_its_own():
     torch.testing.assert_close(lpv(light, receivers), given, rtol=1e-6, atol=0)
 
 
+@pytest.mark.parametrize("name", ["propogation", "stencil"])
+def test_values_of_nothing_are_refused(name):
+    """A misspelt one would change nothing, and so would a stencil's numbers where none is learned."""
+    lpv, light, receivers = solved(LpvConfig(method="learned_4x6", steps=3), learn=["propagation"])
+    with pytest.raises(ValueError, match=f"values: expected names of learnables .*, got '{name}'"):
+        lpv(light, receivers, {name: torch.zeros((), dtype=torch.float64)})
+
+
 def test_values_on_their_bounds_are_put_just_inside():
     lpv = Lpv(GRID, LpvConfig(steps=3), learn=["propagation", "sampling_bias"])
     ends = {"propagation": torch.tensor(0.0, dtype=torch.float64), "sampling_bias": torch.tensor(2.0, dtype=torch.float64)}
@@ -198,6 +206,13 @@ def test_a_light_that_moves_out_of_its_cells_is_followed():
         assert float(mean.detach()) == pytest.approx(1.0 - down - 0.5 * 0.39, abs=0.3 * 0.39)
         (gradient,) = torch.autograd.grad(mean, value)
         assert float(gradient[0, 1]) == pytest.approx(1.0, abs=0.5)
+
+
+def test_normals_that_are_no_unit_vectors_are_named():
+    """They would be read with another cosine, and elsewhere: a plausible number."""
+    _, light, _ = solved(LpvConfig(steps=1))
+    with pytest.raises(ValueError, match=r"normal: expected unit length, got 0\.5 in row 1"):
+        light.receivers(POSITION, NORMAL * [[1.0], [0.5]])
 
 
 def test_points_that_are_not_finite_are_named():
