@@ -1,5 +1,6 @@
 """Each solver on problems whose optimum is known on paper."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -25,6 +26,22 @@ ROSENBROCK = {
     "nlopt-lbfgs": (300, 1e-5),
     "cma": (1500, 1e-4),
 }
+
+
+def test_cma_draws_from_numbers_of_its_own():
+    """Neither does it reseed numpy's generator, nor does it matter who else draws from that."""
+    pytest.importorskip("cma")
+    np.random.seed(5)
+    expected = np.random.rand()
+
+    def losses(**options):
+        problem = Problem(lambda p: ((p["x"] - 0.3) ** 2).sum(), [Parameter("x", [0.5] * 3, 0, 1)])
+        return [point.loss for point in solve(problem, "cma", budget=60, **options).history]
+
+    np.random.seed(5)
+    alone = losses()
+    assert np.random.rand() == expected
+    assert losses(callback=lambda point: np.random.rand()) == alone
 
 
 @pytest.mark.parametrize("solver", DESCENT)

@@ -120,11 +120,12 @@ def _with_idle(u: np.ndarray, idle: bool, value: float) -> np.ndarray:
 
 
 def _options(box: Box, idle: bool, seed: int, tolerance: float, population: int | None) -> dict[str, Any]:
-    """The package's options: silent, no files, our bounds and seed."""
+    """The package's options: silent, no files, our bounds and random numbers."""
     low, high = _with_idle(box.lower, idle, 0.0), _with_idle(box.upper, idle, 1.0)
     options = {
         "bounds": [_plain(low), _plain(high)],
-        "seed": seed + 1,  # it takes 0 for "by the clock"
+        "seed": math.nan,  # leave numpy's own generator alone
+        "randn": np.random.RandomState(seed + 1).randn,
         "tolfun": tolerance,
         "tolx": tolerance,
         "verbose": -9,

@@ -1,7 +1,7 @@
 """Book-keeping that all solvers share: budget, time, best point, history, checkpoint, and how a run ends.
 
-A solver is a loop that calls ``Run.evaluate`` and, where it can be resumed, ``Run.mark`` after each completed step.
-``Run.evaluate`` ends the loop by raising ``StopRun``; ``Run.execute`` turns that, and Ctrl-C, into an ``OptimResult``.
+A solver is a loop that calls ``Run.value`` or ``Run.value_and_grad``, which end it by raising ``StopRun``, and, where it can
+be resumed, ``Run.mark`` after each completed step; ``Run.execute`` turns that, and Ctrl-C, into an ``OptimResult``.
 """
 
 from __future__ import annotations
