@@ -44,12 +44,13 @@ class FittedRecord:
 
 
 def write_fitted(folder: str | Path, record: FittedRecord) -> None:
-    """Write a model; the tensors first, so that a ``fitted.json`` always has its numbers beside it."""
+    """Write a model; the tensors first, so that a ``fitted.json`` always has its numbers beside it.
+
+    Raises:
+        TypeError, ValueError: provenance that is no JSON, or a value that is not finite; what lies there is left as it is.
+    """
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     values = {name: value.detach().cpu().contiguous() for name, value in record.values.items()}
-    with atomic_path(folder / _TENSORS) as path:
-        save_file(values, path)
     grid = record.grid
     described = {
         "format": FORMAT,
@@ -59,6 +60,10 @@ def write_fitted(folder: str | Path, record: FittedRecord) -> None:
         "values": {name: value.tolist() for name, value in values.items()},
         "provenance": record.provenance,
     }
+    json.dumps(described, allow_nan=False)  # before anything is on the disk
+    folder.mkdir(parents=True, exist_ok=True)
+    with atomic_path(folder / _TENSORS) as path:
+        save_file(values, path)
     write_json(folder / _JSON, described)
 
 

@@ -35,6 +35,14 @@ def test_record_round_trip(folder):
     assert sorted(p.name for p in folder.iterdir()) == ["fitted.json", "fitted.safetensors"]
 
 
+@pytest.mark.parametrize("provenance", [{"loss": float("nan")}, {"loss": torch.tensor(0.1)}])
+def test_what_is_no_json_leaves_the_model_that_lies_there(folder, provenance):
+    other = FittedRecord(CONFIG, GRID, {"propagation": torch.tensor(0.7, dtype=torch.float64)}, provenance)
+    with pytest.raises((TypeError, ValueError), match="JSON"):
+        write_fitted(folder, other)
+    assert read_fitted(folder).values["propagation"].item() == 0.1
+
+
 def test_module_round_trip_predicts_the_same(tmp_path):
     scene = box_scene()
     learn = ["propagation", "propagation_steps", "occlusion", "sampling_bias", "injection_bias", "light_color", "albedo"]
