@@ -89,6 +89,15 @@ def test_lights_that_did_not_place_are_what_counts():
     assert not honest.details["met"] and len(honest) == 24
 
 
+def test_lights_held_out_that_are_dark_meet_nothing():
+    """No error can be seen there: it was 0, and the first eight probes met every tolerance."""
+    task = lamps_task((-1.5, 0.0, 0.0), (1.0, 0.0, 0.0), (1.6, 0.3, 0.3), points=100)
+    radiance = task.radiance.clone()
+    radiance[..., 6:] = 0
+    with pytest.raises(ValueError, match="tolerance: expected light at the points held out under light sets 2, got none"):
+        place(replace(task, radiance=radiance), 10, "gradient", steps=4, tolerance=0.1)
+
+
 def test_ends_with_few_probes_that_meet_it():
     task = lamps_task((-1.0, 0.3, 0.2), size=1.5)
     options = {"steps": 12, "relocations": 0}

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -172,6 +173,12 @@ def test_decoupled_direct_light_does_not_attract_probes(task):
     start = uniform_grids(task, 20)[0].position
     apart = np.linalg.norm(still.position[:, None] - start, axis=2)
     assert len(still) == len(start) and apart.min(1).max() < 1e-6
+
+
+def test_probes_without_any_light_to_climb_are_clustered(task):
+    dark = replace(task.field, values=torch.zeros_like(task.field.values))
+    placement = place_irradiance_ascent(task, 10, indirect=dark)
+    assert len(placement) == placement.details["dark_probes"] == 10
 
 
 def test_greedy_removal_keeps_what_matters(task):

@@ -27,7 +27,7 @@ _BT709 = np.array([0.2126, 0.7152, 0.0722])
 
 def luminance(rgb: np.ndarray) -> np.ndarray:
     """Luminance (ITU-R BT.709) [..., lights] of RGB of one light after the other [..., 3 x lights]."""
-    return np.asarray(rgb.reshape(*rgb.shape[:-1], -1, 3) @ _BT709)
+    return np.asarray(rgb.reshape(*rgb.shape[:-1], rgb.shape[-1] // 3, 3) @ _BT709)
 
 
 class Contrast:

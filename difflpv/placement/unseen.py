@@ -44,7 +44,7 @@ class Unseen:
         """Hold out.
 
         Raises:
-            ValueError: fewer than five points.
+            ValueError: fewer than five points, or none of those held out gets light.
         """
         count = len(task.points)
         if count < _POINTS:
@@ -54,12 +54,12 @@ class Unseen:
         unseen = lights[_LIGHTS - 1 :: _LIGHTS]
         placing = [number for number in lights if number not in unseen]
         judging = unseen or lights
-        return cls(
-            task.part(points=~others, lights=placing),
-            task.part(points=~others, lights=judging),
-            task.part(points=others, lights=judging),
-            tuple(unseen),
-        )
+        judge = task.part(points=others, lights=judging)
+        if not (judge.weights[:, None, None] * judge.radiance).any():  # nothing would be an error there
+            sets = ", ".join(map(str, judging))
+            raise ValueError(f"tolerance: expected light at the points held out under light sets {sets}, got none")
+        fit = task.part(points=~others, lights=judging)
+        return cls(task.part(points=~others, lights=placing), fit, judge, tuple(unseen))
 
     @torch.no_grad()
     def error(self, descent: Descent, probes: Probes, *, confidence: float) -> Estimate:
@@ -81,8 +81,6 @@ class Unseen:
         truth = irradiance_coordinates(self.judge.radiance)
         squared, power = (_by_light(self.judge, part) for part in (found - truth, truth))
         lit = power.any(1)
-        if not lit.any():
-            return Estimate(0.0, 0.0, 0.0)
         return ErrorSamples(squared[lit], power[lit]).estimate(confidence=confidence, draw_cases=bool(self.lights))
 
 
