@@ -52,7 +52,8 @@ class ErrorSamples:
         """From irradiance [cases, n, 3] found and traced, the standard errors of the latter, and weights [cases, n].
 
         Raises:
-            ValueError: shapes that do not fit, or numbers that are not finite.
+            ValueError: shapes that do not fit, numbers that are not finite, or a case whose truth is all noise: what is left of
+                its square could make any error 0.
         """
         if not (found.shape == truth.shape == standard_error.shape) or found.ndim != 3 or weight.shape != found.shape[:2]:
             shapes = [list(a.shape) for a in (found, truth, standard_error, weight)]
@@ -60,8 +61,12 @@ class ErrorSamples:
         if not all(np.isfinite(a).all() for a in (found, truth, standard_error, weight)):
             raise ValueError("error samples: expected finite numbers, got NaN or infinity")
         variance = (standard_error.astype(float) ** 2).sum(-1)
-        squared = ((found - truth).astype(float) ** 2).sum(-1) - variance
-        return cls(weight * squared, weight * ((truth.astype(float) ** 2).sum(-1) - variance))
+        squared, whole = ((part.astype(float) ** 2).sum(-1) for part in (found - truth, truth))
+        energy, noise = ((weight * part).sum(1) for part in (whole, variance))
+        lost = (energy > 0) & (energy <= (1 + 1e-9) * noise)
+        if lost.any():
+            raise ValueError(f"error samples: the truth of case {int(lost.argmax())} cannot be told from its noise")
+        return cls(weight * (squared - variance), weight * (whole - variance))
 
     def estimate(self, *, confidence: float = 0.95, seed: int = 0, draw_cases: bool = False) -> Estimate:
         """The error and its bounds, each one-sided with ``confidence``; of so many other cases with ``draw_cases``."""

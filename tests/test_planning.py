@@ -123,6 +123,15 @@ def test_the_truths_noise_is_not_taken_for_error():
     assert bright.high - bright.low < 0.05
 
 
+def test_a_truth_that_is_all_noise_is_refused():
+    """What noise leaves of its square is below 0, and over next to nothing it made the error of all cases 0."""
+    truth = np.ones((2, 50, 3))
+    truth[1] = np.random.default_rng(0).normal(size=(50, 3))
+    noise = np.stack([np.zeros((50, 3)), np.full((50, 3), 1.5)])
+    with pytest.raises(ValueError, match="error samples: the truth of case 1 cannot be told from its noise"):
+        ErrorSamples.of(np.stack([np.full((50, 3), 9.0), np.zeros((50, 3))]), truth, noise, np.ones((2, 50)))
+
+
 def test_bounds_hold_as_often_as_they_say():
     random, inside = np.random.default_rng(1), 0
     for trial in range(200):

@@ -50,6 +50,22 @@ def test_a_light_set_that_brings_no_light_is_passed_over(tmp_path):
         HeldOutTruth(scene, "direct", [dark], tmp_path / "dark", levels=LEVELS).level(0)
 
 
+def test_a_light_set_that_brings_no_more_light_than_noise_is_passed_over(tmp_path, monkeypatch):
+    """One path of 32 that finds the light at one receiver: its standard error is all that it brings."""
+    trace = HeldOutTruth._trace
+
+    def unlucky(self, number, sets):
+        trace(self, number, sets)
+        if number == 0 and 0 in sets:
+            for table in (self._part(0).irradiance, self._part(0).standard_error):
+                table[0] = np.zeros((40, 3))
+                table[0][7] = 0.25
+
+    monkeypatch.setattr(HeldOutTruth, "_trace", unlucky)
+    scene = panel_scene(floor=2.0)
+    assert HeldOutTruth(scene, "direct", held_out_lights(scene, 3), tmp_path, levels=LEVELS).level(1).sets == (1, 2)
+
+
 def test_levels_never_become_smaller(tmp_path):
     with pytest.raises(ValueError, match="levels: expected receivers and lights that never become fewer"):
         judge_of(tmp_path, levels=(Level(40, 32, 2), Level(30, 32, 2)))

@@ -137,10 +137,14 @@ class HeldOutTruth:
         return LevelTruth(tuple(parts), tuple(sets), irradiance, error, joined(weights))
 
     def _sets(self, wanted: int) -> list[int]:
-        """The first light sets that bring light."""
+        """The first light sets that bring light, more of it than their paths make noise."""
         part = self._part(0)
+
+        def energy(values: np.ndarray, number: int) -> float:
+            return float((part.weight[number][:, None] * values**2).sum())
+
         while True:
-            lit = [number for number, irradiance in part.irradiance.items() if irradiance.any()]
+            lit = [k for k, found in part.irradiance.items() if energy(found, k) > 2 * energy(part.standard_error[k], k)]
             rest = [number for number in range(len(self.light_sets)) if number not in part.irradiance]
             if len(lit) >= wanted or not rest:
                 break
