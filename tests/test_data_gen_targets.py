@@ -1,6 +1,7 @@
 """Targets on disk: equal bits, resume, recognition, messages, files."""
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from data_gen.few_paths import PathPool
 from data_gen.load import TargetsError, load_targets
 from data_gen.receivers import draw_receivers
 from data_gen.targets import make_targets
+from data_gen.workers import start_pool
 from difflpv.io import load_scene
 from difflpv.io.exr import read_image
 from difflpv.io.tables import load_table
@@ -282,3 +284,15 @@ def test_workers_start_without_torch_warp_and_scipy():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs SIGINT")
+def test_workers_that_are_still_starting_do_not_hear_ctrl_c():
+    pool = start_pool(1)
+    try:
+        found = pool.submit(os.getpid)
+        (process,) = list(pool._processes)
+        os.kill(process, signal.SIGINT)
+        assert found.result(timeout=120) == process
+    finally:
+        pool.shutdown()
