@@ -35,7 +35,7 @@ class _Steps:
         owner = owner.ravel()
         self.faces, self.neighbours = len(cells), len(neighbours)
         topology = {
-            "line_shift": neighbours[:, 2] * (layout.y + 2) + neighbours[:, 1],
+            "line_shift": neighbours[:, 2] * layout.pitch_y + neighbours[:, 1],
             "x_shift": neighbours[:, 0],
             "first": np.concatenate([[0], np.cumsum(np.bincount(owner))]),
             "face": np.argsort(owner, kind="stable"),
@@ -80,7 +80,7 @@ class _Steps:
         arguments = [
             as_warp(moving), as_warp(into), as_warp(total), as_warp(self._arriving), v["weights"], v["lobes"], v["factor"],
             v["line_shift"], v["x_shift"], v["first"], v["face"], v["axis"], *where, self.neighbours, self.faces, step,
-            layout.y + 2, layout.pitch, layout.channels // _group(layout), layout.z, layout.y, layout.x,
+            layout.pitch_y, layout.pitch, layout.channels // _group(layout), layout.z, layout.y, layout.x,
         ]  # fmt: skip
         self._launch(forward_kernel(self._scalar, **self._spec(step)), arguments)
 
@@ -99,7 +99,7 @@ class _Steps:
             as_warp(moving), as_warp(lobe_bar), as_warp(into), as_warp(total_bar), as_warp(volume_bar), as_warp(self._leaving),
             as_warp(transmittance_bar), as_warp(factor_bar), v["weights"], v["lobes"], v["factor"], v["line_shift"],
             v["x_shift"], v["face_neighbour"], v["axis"], 0 if start else self.faces // 2, self.faces, int(step == 0), step,
-            layout.y + 2, layout.pitch, layout.channels // _group(layout), layout.z, layout.y, layout.x,
+            layout.pitch_y, layout.pitch, layout.channels // _group(layout), layout.z, layout.y, layout.x,
         ]  # fmt: skip
         self._launch(adjoint_kernel(self._scalar, **self._spec(step), **flags), arguments)
 

@@ -44,7 +44,7 @@ class _Steps:
         weights[self._place] = matrices.detach()
         self.paired = _mirrored(weights)
         swapped = [0] + [i + (1 if i % 2 else -1) for i in range(1, len(order))]
-        line_shift = self.pairs[:, 2] * (layout.y + 2) + self.pairs[:, 1]
+        line_shift = self.pairs[:, 2] * layout.pitch_y + self.pairs[:, 1]
         self._tensors = {  # keeps them alive
             "weights": weights, "adjoint weights": weights[swapped].transpose(1, 2).contiguous(),
             "factor": factors.detach().contiguous(), "transmittance": self._padded(transmittance.detach()),
@@ -115,7 +115,7 @@ class _Steps:
         kernel = step_kernel(self._scalar, **self._spec(step), paired=self.paired, **flags)
         arguments = [
             as_warp(moving), as_warp(into), as_warp(total), v["transmittance"], before, transmittance_bar, factor_bar,
-            v[weights], v["factor"], v["line_shift"], v["x_shift"], *where, len(self.pairs), step, layout.y + 2,
+            v[weights], v["factor"], v["line_shift"], v["x_shift"], *where, len(self.pairs), step, layout.pitch_y,
             layout.pitch, layout.channels, layout.z, layout.y, layout.x,
         ]  # fmt: skip
         self.launcher.launch(kernel, layout.z * layout.y, self._width, arguments)
@@ -126,7 +126,7 @@ class _Steps:
         slabs, rows = self.slabs
         arguments = [
             as_warp(after), as_warp(before), v["transmittance"], as_warp(partial.view(-1)), v["factor"], v["line_shift"],
-            v["x_shift"], len(self.pairs), step, layout.y + 2, layout.pitch, layout.channels, rows, layout.y, layout.x,
+            v["x_shift"], len(self.pairs), step, layout.pitch_y, layout.pitch, layout.channels, rows, layout.y, layout.x,
         ]  # fmt: skip
         self.launcher.launch(matrices_kernel(self._scalar, **self._spec(step)), slabs, partial.shape[1], arguments)
 

@@ -1,9 +1,10 @@
 """Padded buffers of the propagation kernels, their launches on slabs of rows, and the march over steps there and back.
 
-A buffer is flat: rows of cells along x, all fields of a row together, ``[n_z+2, n_y+2, fields, pitch]`` with ``pitch`` =
-ceil(n_x / lanes) lanes + 2 and ``lanes`` spare elements at the end. The halo of one cell is zero, so that kernels need no
-bounds checks and may read ``lanes`` cells at once. (Rows that start on vector boundaries were slower: their margins cost more
-memory than aligned access saves.)
+A buffer is flat: rows of cells along x, all fields of a row together. A halo of one cell is zero, so that kernels need no
+bounds checks and may read ``lanes`` cells at once. What ends one row begins the next, and so with slices of rows: cell
+(x, y, z) of a field lies at ``(((z+1) pitch_y + y+1) fields + field) pitch + x+1`` with ``pitch_y`` = n_y + 1 and ``pitch`` =
+ceil(n_x / lanes) lanes + 1, and ``lanes`` spare elements lie at the end. (Rows that start on vector boundaries were slower:
+their margins cost more memory than aligned access saves.)
 
 Adjoint of A = sum_i S_i with S_{i+1} = F_i(S_i): G_N = Abar (and the cotangent of S_N, where that is asked for too),
 G_i = Abar + (dF_i/dS)^T G_{i+1}, and the volume's gradient is G_0. Volumes are kept only where that derivative or a
@@ -60,24 +61,38 @@ class Layout:
     @property
     def pitch(self) -> int:
         """Elements from one field of a row to the next."""
-        return -(-self.x // self.lanes) * self.lanes + 2
+        return -(-self.x // self.lanes) * self.lanes + 1
+
+    @property
+    def pitch_y(self) -> int:
+        """Rows from one slice of them to the next."""
+        return self.y + 1
+
+    @property
+    def rows(self) -> int:
+        """Rows of a buffer, those of the halo among them."""
+        return (self.z + 2) * self.pitch_y + 1
 
     def length(self, fields: int) -> int:
         """Elements of a flat buffer of so many fields."""
-        return (self.z + 2) * (self.y + 2) * fields * self.pitch + self.lanes
+        return self.rows * fields * self.pitch + self.lanes
 
     def empty(self, fields: int, like: torch.Tensor) -> torch.Tensor:
         """Zeroed flat buffer of so many padded scalar fields."""
         return torch.zeros(self.length(fields), dtype=like.dtype, device=like.device)
 
     def view(self, buffer: torch.Tensor, fields: int) -> torch.Tensor:
-        """View with the halo, shape [n_z + 2, n_y + 2, fields, pitch]."""
-        return buffer[: -self.lanes].view(self.z + 2, self.y + 2, fields, self.pitch)
+        """View with the halo, shape [n_z + 2, n_y + 2, fields, pitch + 1]; its ends overlap."""
+        row = fields * self.pitch
+        return buffer.as_strided(
+            (self.z + 2, self.y + 2, fields, self.pitch + 1), (self.pitch_y * row, row, self.pitch, 1)
+        )
 
     def clear_border(self, buffer: torch.Tensor, fields: int) -> None:
         """Zero what a step does not write of a flat buffer: the rows of the halo and the spare end."""
-        view = self.view(buffer, fields)
-        for border in (view[0], view[-1], view[:, 0], view[:, -1], buffer[-self.lanes :]):
+        rows = buffer[: -self.lanes].view(self.rows, -1)
+        first, last = rows[: self.pitch_y + 1], rows[-self.pitch_y - 1 :]
+        for border in (first, last, rows[:: self.pitch_y], buffer[-self.lanes :]):
             border.zero_()
 
     def inside(self, buffer: torch.Tensor, fields: int, offset: tuple[int, int, int] = (0, 0, 0)) -> torch.Tensor:
@@ -120,10 +135,11 @@ class Spans:
         box = np.array(read_box, np.int64).reshape(-1, 2) if len(read_box) else np.stack([0 * size, size], 1)
         left = np.arange(steps)[:: 1 if last_first else -1, None, None]  # light goes one cell a step
         needed = np.clip(box + left * np.array([-1, 1]), 0, size[:, None])
-        dark = np.zeros((groups, layout.z + 2, layout.y + 2, 2), np.int32)
+        dark = np.zeros((groups, layout.rows, 2), np.int32)
         dark[..., 0] = layout.x
         full = dark.copy()
-        full[:, 1:-1, 1:-1] = (0, layout.x)
+        slices = full[:, layout.pitch_y : -layout.pitch_y - 1].reshape(groups, layout.z, layout.pitch_y, 2)
+        slices[:, :, 1:] = (0, layout.x)
         self.needed = torch.as_tensor(needed.astype(np.int32), device=like.device)
         self._dark, self._full = (torch.as_tensor(spans, device=like.device) for spans in (dark, full))
         self.moved = like.new_zeros(groups * layout.z * layout.y)
@@ -215,7 +231,7 @@ def march(
         return states[step // keep] if kept else scratch[step % len(scratch)]
 
     def flux(buffer: torch.Tensor) -> float:
-        return float(layout.inside(buffer, fields)[:: layout.coeffs].abs().sum())
+        return float(torch.linalg.vector_norm(layout.inside(buffer, fields)[:: layout.coeffs], ord=1))
 
     total = layout.pad(volume, into=home(0)).clone()
     injected = flux(home(0)) if tolerance else 0.0

@@ -16,10 +16,10 @@ Only H passes from one adjoint step to the next; the sweep starts with no faces 
 Faces come in antipodal pairs (2j, 2j+1): the even degrees of W are equal and the odd ones opposite, so the adjoint
 evaluates both fluxes of a source cell with one set of products.
 
-Layout: rows of cells along x, all fields of a row together: ``[n_z+2, n_y+2, fields, pitch]``, ``pitch`` =
-ceil(n_x / LANES) LANES + 2. The halo of one cell stays zero, so there are no bounds checks. Fields are (c, k) for volumes,
-f for T, (c, a) for H. The forward step reads T where it arrives, ``arriving[i,d]`` = T[f,d-n_f] with i the place of f in
-``face``, so that every row is read in order. Arrays are passed flat with at least ``LANES`` spare elements at the end.
+Layout: ``difflpv.padded``: rows of cells along x, all fields of a row together, a halo of one cell that stays zero, so there
+are no bounds checks. Fields are (c, k) for volumes, f for T, (c, a) for H. The forward step reads T where it arrives,
+``arriving[i,d]`` = T[f,d-n_f] with i the place of f in ``face``, so that every row is read in order. Arrays are passed flat
+with at least ``LANES`` spare elements at the end.
 
 Threads: one per (channel group, z, y) row on the CPU, one per cell on CUDA. Within a row the CPU works on ``LANES``
 neighbouring cells at once (vector extension of the compiler that Warp brings along): Warp itself does not vectorise across

@@ -8,7 +8,7 @@ widen it. Values are those of a step that leaves out nothing, bit for bit, where
 
 Beside the spans a step leaves the sum of |S_0| of each row: adding those up costs a thousandth of a step.
 
-Arrays: ``lit``, ``lit_next`` [groups, n_z+2, n_y+2, 2] of S and S', rows of the halo empty; ``needed`` [steps, 6], the box
+Arrays: ``lit``, ``lit_next`` [groups, rows, 2] of S and S', rows of the halo empty; ``needed`` [steps, 6], the box
 z, y, x as (begin, end) pairs after each step; ``moved`` [groups, n_z, n_y]. On CUDA, where a thread has one cell, and in the
 adjoint all of it is left out.
 """
@@ -18,7 +18,7 @@ import re
 __all__ = ["fill_spans"]
 
 _BEGIN = """
-    const long long span_at = 2 * ((long long)SPAN_GROUP * (z_size + 2) * pitch_y + line);
+    const long long span_at = 2 * (SPAN_GROUP * ((long long)(z_size + 2) * pitch_y + 1) + line);
     const int* box = needed.data + 6 * step;
     int lit_begin = x_size, lit_end = 0, new_begin = x_size, new_end = 0;
     for (int dz = -1; dz <= 1; ++dz)
