@@ -13,7 +13,8 @@ import numpy as np
 import torch
 
 from difflpv.bridge import as_warp, refuse_second_derivative, warp_scalar
-from difflpv.padded import Layout, SlabLauncher, Spans, kept_volumes, last_bar, march, steps_back, volumes_between
+from difflpv.padded import Layout, Spans, kept_volumes, last_bar, march, steps_back, volumes_between
+from difflpv.slabs import SlabLauncher
 from difflpv.stencil import FaceStencil
 from warp_kernels.propagation import CPU_LANES, adjoint_kernel, forward_kernel
 

@@ -5,7 +5,7 @@ What moves or scales with a learnable (light power and position, albedo) is appl
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal, get_args
 
@@ -32,6 +32,7 @@ from difflpv.probes.rows import Rows
 from difflpv.raycast import Raycaster
 from difflpv.rsm import Rsm, TexelFlux, render_rsm, rsm_blockers, rsm_vpls
 from difflpv.scene import AreaLight, Scene, SceneError
+from difflpv.sh import cosine_lobe
 from difflpv.surface import SurfaceSamples, sample_surfaces
 from difflpv.vpl import Vpls
 
@@ -93,9 +94,16 @@ class Receivers:
     lookup: Lookup = "trilinear"
     boxes: tuple[tuple[int, ...], ...] = ()
     rows: Rows | None = None
+    _lobes: dict[int, torch.Tensor] = field(default_factory=dict, repr=False)
 
     def __len__(self) -> int:
         return len(self.position)
+
+    def lobes(self, l_max: int) -> torch.Tensor:
+        """What each reads light with that flies along its coefficients, [n,(l_max+1)^2]: made once."""
+        if l_max not in self._lobes:
+            self._lobes[l_max] = cosine_lobe(-self.normal, l_max)
+        return self._lobes[l_max]
 
 
 @dataclass(frozen=True, eq=False)

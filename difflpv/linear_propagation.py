@@ -14,7 +14,8 @@ import numpy as np
 import torch
 
 from difflpv.bridge import as_warp, refuse_second_derivative, warp_scalar
-from difflpv.padded import Layout, SlabLauncher, Spans, kept_volumes, last_bar, march, nest, steps_back, volumes_between
+from difflpv.padded import Layout, Spans, kept_volumes, last_bar, march, nest, steps_back, volumes_between
+from difflpv.slabs import SlabLauncher
 from difflpv.stencil import pair_offsets
 from warp_kernels.linear_propagation import cpu_lanes, matrices_kernel, step_kernel
 

@@ -1,4 +1,4 @@
-"""Padded buffers of the propagation kernels, their launches on slabs of rows, and the march over steps there and back.
+"""Padded buffers of the propagation kernels, and the march over steps there and back.
 
 A buffer is flat: rows of cells along x, all fields of a row together. A halo of one cell is zero, so that kernels need no
 bounds checks and may read ``lanes`` cells at once. What ends one row begins the next, and so with slices of rows: cell
@@ -19,18 +19,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import torch
 
-from difflpv.bridge import as_warp, record, replay
+from difflpv.bridge import as_warp
 
 __all__ = [
-    "Forward", "Layout", "SlabLauncher", "Spans", "kept_volumes", "last_bar", "march", "nest", "steps_back", "volumes_between",
+    "Forward", "Layout", "Spans", "kept_volumes", "last_bar", "march", "nest", "steps_back", "volumes_between",
 ]  # fmt: skip
 
 _KEEP_ALL_BYTES = 2**30
@@ -165,42 +163,6 @@ class Spans:
 
 # S_{step+1} from S_step, added onto a total: (moving, into, total, step, spans), the first three flat padded buffers.
 Forward = Callable[[torch.Tensor, torch.Tensor, torch.Tensor, int, Spans], None]
-
-
-@lru_cache
-def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, thread_name_prefix="difflpv-slab")
-
-
-class SlabLauncher:
-    """Launches a kernel on slabs of its first dimension, one per thread on the CPU; replays what an earlier step recorded."""
-
-    def __init__(self, device: torch.device) -> None:
-        self.device = device
-        self._commands: dict[tuple[Any, int, int], list[Any]] = {}  # recorded: a generic launch costs ten replays
-
-    def launch(self, kernel: Any, items: int, width: int, arguments: list[Any], *, first: int = 0) -> None:
-        """Run ``items`` x ``width`` threads, items from ``first``; the kernel's last argument is the first item of a slab."""
-        if not items:
-            return
-        threads = 1 if self.device.type == "cuda" else max(1, min(torch.get_num_threads(), items))
-        bounds = [first + items * i // threads for i in range(threads + 1)]
-        if (kernel, threads, first) not in self._commands:
-            self._commands[kernel, threads, first] = [
-                record(kernel, (bounds[i + 1] - bounds[i], width), [*arguments, bounds[i]], self.device) for i in range(threads)
-            ]
-        commands = self._commands[kernel, threads, first]
-        for command in commands:
-            for index, value in enumerate(arguments):
-                command.set_param_at_index_from_ctype(index, value)
-        waiting = [_pool(threads).submit(command.launch) for command in commands[1:]]
-        replay(commands[0], self.device)
-        for future in waiting:
-            future.result()
-
-    def release(self) -> None:
-        """Forget the recorded launches, which keep the buffers of the last one alive."""
-        self._commands.clear()
 
 
 def volumes_between(layout: Layout, volume: torch.Tensor, steps: int, checkpoint_every: int | None) -> int:

@@ -24,7 +24,6 @@ from difflpv.probes.lookup import probe_irradiance
 from difflpv.propagation import propagate, propagate_moving
 from difflpv.sampling import sample_irradiance
 from difflpv.scene import Scene
-from difflpv.sh import cosine_lobe
 from difflpv.stencil import LinearStencil, pair_offsets
 from difflpv.stencil_coordinates import StencilCoordinates
 from difflpv.weighted import gather_lobes
@@ -304,9 +303,9 @@ class Lpv(torch.nn.Module):
         if receivers.rows is not None:
             held = probe_radiance(volumes, grids, receivers.reads[: len(grids)], gains)
             return probe_irradiance(receivers.rows, held, n)
-        lobe, parts = cosine_lobe(-n, self.config.stencil.l_max), []
+        lobe, parts = receivers.lobes(self.config.stencil.l_max), []
         for volume, grid, r in zip(volumes, grids, receivers.reads[: len(grids)], strict=True):
-            lobes = lobe * (1 + (gains - 1) * r.backed[:, None])
+            lobes = torch.addcmul(lobe, lobe * r.backed[:, None], gains - 1)
             parts.append(gather_lobes(volume, r.cells, r.weights, lobes) / grid.cell_size**2)
         return torch.stack(parts).sum(0)
 

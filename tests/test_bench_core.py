@@ -61,7 +61,7 @@ def test_peak_memory_of_what_is_held_at_one_time():
 
 def test_a_solve_without_gradients_holds_two_padded_volumes_and_the_transmittance():
     cells, fields = 32, 27
-    padded = (cells + 2) ** 3 / cells**3  # a halo of one cell; rows of whole vectors fit 32 cells
+    padded = (cells + 2) * (cells + 1) ** 2 / cells**3  # rows and slices share their halo; whole vectors fit 32 cells
     unit = 4 * fields * cells**3
     opened, occluded = (peak_bytes(growth._solve(cells, occluded=blocks)) / unit for blocks in (False, True))
     assert growth._two_buffers(cells) / (fields * cells**3) == pytest.approx(2 * padded, rel=1e-3)

@@ -41,7 +41,7 @@ LAYERS: tuple[tuple[str, tuple[str, ...]], ...] = (
             "difflpv.triangle_distance",
         ),
     ),
-    ("bridge", ("difflpv.bridge", "difflpv.coordinates", "difflpv.vpl")),
+    ("bridge", ("difflpv.bridge", "difflpv.coordinates", "difflpv.slabs", "difflpv.vpl")),
     (
         "stages",
         (

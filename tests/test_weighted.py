@@ -17,10 +17,12 @@ def case(dtype=torch.float64, points=7, coeffs=9, channels=3, seed=0):
     return volume, cells, weights, lobes, flux
 
 
+@pytest.mark.parametrize("points", [1, 600], ids=["a volume apart", "rows of cells"])
+@pytest.mark.parametrize("channels", [1, 3])
 @pytest.mark.parametrize("coeffs", [1, 4, 9, 16])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_values_agree_with_the_twin(coeffs, dtype):
-    volume, cells, weights, lobes, flux = case(dtype, coeffs=coeffs)
+def test_values_agree_with_the_twin(coeffs, dtype, channels, points):
+    volume, cells, weights, lobes, flux = case(dtype, points, coeffs, channels)
     tolerance = {"rtol": 1e-5, "atol": 1e-5} if dtype == torch.float32 else {"rtol": 1e-12, "atol": 1e-12}
     gathered = gather_lobes(volume, cells, weights, lobes)
     torch.testing.assert_close(gathered, twin.gather_lobes(volume, cells, weights, lobes), **tolerance)
@@ -35,10 +37,34 @@ def test_gather_and_spread_are_transposes():
     torch.testing.assert_close(read, given, rtol=1e-13, atol=0)
 
 
-def test_gradients():
-    volume, cells, weights, lobes, flux = (t.requires_grad_() if t.is_floating_point() else t for t in case(points=3))
+@pytest.mark.parametrize("points", [1, 3], ids=["a volume apart", "rows of cells"])
+def test_gradients(points):
+    volume, cells, weights, lobes, flux = (t.requires_grad_() if t.is_floating_point() else t for t in case(points=points))
     assert torch.autograd.gradcheck(lambda v, w, o: gather_lobes(v, cells, w, o), (volume, weights, lobes))
     assert torch.autograd.gradcheck(lambda f, w, o: spread_lobes(f, cells, w, o, SHAPE), (flux, weights, lobes))
+
+
+@pytest.mark.parametrize("points", [1, 9])
+def test_gradients_of_some_are_those_of_all(points):
+    volume, cells, weights, lobes, _ = case(points=points)
+    every = [t.clone().requires_grad_() for t in (volume, weights, lobes)]
+    whole = torch.autograd.grad(gather_lobes(every[0], cells, *every[1:]).square().sum(), every)
+    for i in range(3):
+        some = [t.clone().requires_grad_(i == j) for j, t in enumerate((volume, weights, lobes))]
+        (bar,) = torch.autograd.grad(gather_lobes(some[0], cells, *some[1:]).square().sum(), some[i])
+        assert torch.equal(bar, whole[i])
+
+
+def test_any_number_of_threads_gives_the_same_bits():
+    volume, cells, weights, lobes, flux = case(torch.float32, points=900)
+    threads, found = torch.get_num_threads(), []
+    try:
+        for count in (1, 2, 5, 40):  # 40: more than cells
+            torch.set_num_threads(count)
+            found.append((gather_lobes(volume, cells, weights, lobes), spread_lobes(flux, cells, weights, lobes, SHAPE)))
+    finally:
+        torch.set_num_threads(threads)
+    assert all(torch.equal(a, b) for other in found[1:] for a, b in zip(found[0], other, strict=True))
 
 
 def test_two_backwards_agree_and_strided_input_is_read_in_order():
