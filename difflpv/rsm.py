@@ -21,7 +21,6 @@ from difflpv.bridge import check_float, launch, refuse_forward_mode, refuse_seco
 from difflpv.coordinates import check_points
 from difflpv.raycast import Raycaster
 from difflpv.scene import AreaLight, DirectionalLight, Light, Scene, SpotLight
-from difflpv.surface import texture_at
 from difflpv.vpl import Vpls
 from warp_kernels.rsm import TEXEL_BLOCK, rsm_kernels
 
@@ -180,7 +179,7 @@ def render_rsm(
     if texel_flux == "thesis":
         attenuation = attenuation * np.abs(cosine)
     mesh = scene.triangle_mesh[triangle]
-    texture = texture_at(scene, triangle, hits.barycentric[lit])
+    texture = scene.texture_at(triangle, hits.barycentric[lit])
     arrays = {
         "position": position, "power": power, "offset": offset, "direction": direction, "normal": normal,
         "plane": (normal * scene.triangle_vertices[triangle, 0]).sum(1), "size": size, "attenuation": attenuation,

@@ -15,7 +15,7 @@ import torch
 from difflpv.bridge import check_float
 from difflpv.scene import AreaLight, Mesh, Scene
 
-__all__ = ["SurfaceSamples", "albedo_by_mesh", "sample_area_light", "sample_surfaces", "texture_at"]
+__all__ = ["SurfaceSamples", "albedo_by_mesh", "sample_area_light", "sample_surfaces"]
 
 _SAMPLES_PER_MESH = 4  # a small mesh still blocks and reflects
 _GOLDEN = (np.sqrt(5.0) - 1) / 2
@@ -71,11 +71,6 @@ def albedo_by_mesh(
 ) -> torch.Tensor:
     """Untextured albedo of each mesh, shape [M,3]: the factor that can be learned on textured surfaces too."""
     return torch.as_tensor(scene.mesh_albedo, dtype=dtype, device=device)
-
-
-def texture_at(scene: Scene, triangle: np.ndarray, barycentric: np.ndarray) -> np.ndarray:
-    """Value of the albedo texture [n,3] (1 where there is none) at ``triangle`` [n] with ``barycentric`` [n,2]."""
-    return scene.texture_at(triangle, barycentric)
 
 
 def sample_surfaces(
@@ -215,7 +210,7 @@ def _samples(
     corners = scene.triangle_vertices[triangle]
     u, v = barycentric[:, 0, None], barycentric[:, 1, None]
     position = (1 - u - v) * corners[:, 0] + u * corners[:, 1] + v * corners[:, 2]
-    texture = texture_at(scene, triangle, barycentric)
+    texture = scene.texture_at(triangle, barycentric)
     mesh = scene.triangle_mesh[triangle]
     normal = scene.triangle_normals[triangle]
     arrays = [position, normal, scene.mesh_albedo[mesh] * texture, texture, weight]

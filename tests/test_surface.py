@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from difflpv.scene import AreaLight, Material, Mesh, Scene, Texture
-from difflpv.surface import SurfaceSamples, albedo_by_mesh, sample_area_light, sample_surfaces, texture_at
+from difflpv.surface import SurfaceSamples, albedo_by_mesh, sample_area_light, sample_surfaces
 
 FIELDS = ("position", "normal", "albedo", "texture", "area", "mesh_index")
 
@@ -101,7 +101,7 @@ def test_texture_at_the_corners():
     image = np.array([[[0.0] * 3, [1.0] * 3], [[0.5] * 3, [0.25] * 3]])
     ground = rectangle("ground", (0, 0, 0), (1, 0, 0), (0, 1, 0), uv=True, texture=Texture(image))
     scene = Scene("ground", (ground,), box_scene().lights)
-    middle = texture_at(scene, np.array([0]), np.array([[0.0, 0.5]]))  # uv (0.5, 0.5): between all four texels
+    middle = scene.texture_at(np.array([0]), np.array([[0.0, 0.5]]))  # uv (0.5, 0.5): between all four texels
     np.testing.assert_allclose(middle, 1.75 / 4)
 
 
