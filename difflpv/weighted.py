@@ -48,7 +48,7 @@ class _CellRows:
         flat = volume.new_empty(rows.numel() + lanes)
         flat[-lanes:] = 0
         flat[:-lanes].view(rows.shape[1], -1).copy_(rows.t())
-        return cls(*volume.shape[:2], len(rows), flat)
+        return cls(volume.shape[0], volume.shape[1], len(rows), flat)
 
     @classmethod
     def dark(cls, channels: int, coeffs: int, cell_count: int, like: torch.Tensor) -> _CellRows:
