@@ -12,12 +12,12 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import time
 from collections.abc import Callable
 from contextlib import nullcontext
 from unittest import mock
 
 import torch
+from probes_lookup import best_seconds
 
 from difflpv import weighted
 from difflpv.weighted import gather_lobes
@@ -32,11 +32,6 @@ def in_torch(volume: torch.Tensor, cells: torch.Tensor, weights: torch.Tensor, l
     return torch.einsum("nck,nk->nc", held.view(len(cells), *volume.shape[:2]), lobes)
 
 
-def apart(*arguments: torch.Tensor) -> torch.Tensor:
-    """``gather_lobes``; ``calls_of`` keeps it from turning the volume."""
-    return gather_lobes(*arguments)
-
-
 def problem(cells: int, points: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
     """Volume, cells, weights and lobes."""
     generator = torch.Generator().manual_seed(points)
@@ -48,16 +43,16 @@ def problem(cells: int, points: int) -> tuple[torch.Tensor, torch.Tensor, torch.
 
 
 def calls_of(
-    read: Callable[..., torch.Tensor], volume: torch.Tensor, cells: torch.Tensor, weights: torch.Tensor, lobes: torch.Tensor
-) -> dict[str, Callable[[], object]]:
-    """Forward, and forward + backward of the volume, and of volume and lobes."""
+    read: Callable[..., torch.Tensor], volume: torch.Tensor, cells: torch.Tensor, weights: torch.Tensor, lobes: torch.Tensor,
+    *, turns: bool = True,
+) -> dict[str, Callable[[], object]]:  # fmt: skip
+    """Forward, and forward + backward of the volume, and of volume and lobes; ``turns``: it may turn the volume."""
 
     def call_of(*learned: bool) -> Callable[[], object]:
         light, read_with = (t.clone().requires_grad_(need) for t, need in zip((volume, lobes), learned, strict=True))
 
         def call() -> None:
-            far = mock.patch.object(weighted, "_turning_pays", lambda *_: False)
-            with far if read is apart else nullcontext():
+            with nullcontext() if turns else mock.patch.object(weighted, "_turning_pays", lambda *_: False):
                 result = read(light, cells, weights, read_with)
                 if any(learned):
                     result.sum().backward()
@@ -81,18 +76,12 @@ def main(argv: list[str] | None = None) -> None:
     print("| points | | ours [ms] | torch / ours | apart / ours |\n|---|---|---|---|---|")
     for points in args.points:
         given = problem(args.cells, points)
-        ways = {way.__name__: calls_of(way, *given) for way in (gather_lobes, in_torch, apart)}
-        best: dict[tuple[str, str], float] = {}
-        for number, (way, calls) in itertools.product(range(args.repeats + 1), ways.items()):
-            for name, call in calls.items():
-                start = time.process_time()
-                call()
-                taken = time.process_time() - start
-                if number:
-                    best[way, name] = min(taken, best.get((way, name), taken))
-        for name in ways["gather_lobes"]:
-            ours, torchs, aparts = (best[way, name] for way in ways)
-            print(f"| {points:,} | {name} | {ours * 1e3:.2f} | {torchs / ours:.1f} | {aparts / ours:.1f} |", flush=True)
+        ways = (calls_of(gather_lobes, *given), calls_of(in_torch, *given), calls_of(gather_lobes, *given, turns=False))
+        calls = {f"{i} {name}": call for i, way in enumerate(ways) for name, call in way.items()}
+        best = best_seconds(calls, args.repeats)
+        for name in ways[0]:
+            ours, in_torchs, apart = (best[f"{i} {name}"] for i in range(len(ways)))
+            print(f"| {points:,} | {name} | {ours * 1e3:.2f} | {in_torchs / ours:.1f} | {apart / ours:.1f} |", flush=True)
 
 
 if __name__ == "__main__":

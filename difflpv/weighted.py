@@ -116,7 +116,7 @@ def _pullback(
     volume: torch.Tensor, cells: torch.Tensor, weights: torch.Tensor, lobes: torch.Tensor, result_bar: torch.Tensor,
     need_weights: bool, need_lobes: bool,
 ) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
-    weights_bar, lobes_bar = _bars(weights, lobes, need_weights, need_lobes)
+    weights_bar, lobes_bar = _empty_bars(weights, lobes, need_weights, need_lobes)
     if _turning_pays(cells, volume[0, 0].numel()):
         turned = _CellRows.of(volume)
         if need_weights:
@@ -133,7 +133,7 @@ def _pullback(
     return weights_bar, lobes_bar
 
 
-def _bars(
+def _empty_bars(
     weights: torch.Tensor, lobes: torch.Tensor, need_weights: bool, need_lobes: bool
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Memory of both gradients, empty where they are not needed."""
@@ -145,10 +145,10 @@ def _bars(
 
 @_pullback.register_fake
 def _(volume, cells, weights, lobes, result_bar, need_weights, need_lobes):
-    return _bars(weights, lobes, need_weights, need_lobes)
+    return _empty_bars(weights, lobes, need_weights, need_lobes)
 
 
-def _pull_back(
+def _needed_bars(
     volume: torch.Tensor, cells: torch.Tensor, weights: torch.Tensor, lobes: torch.Tensor, result_bar: torch.Tensor, *need: bool
 ) -> tuple[torch.Tensor | None, torch.Tensor | None]:
     """``_pullback`` as autograd wants it: None for what is not needed."""
@@ -166,7 +166,7 @@ def _gather_backward(ctx: Any, result_bar: torch.Tensor) -> tuple[torch.Tensor |
     volume, cells, weights, lobes = ctx.saved_tensors
     need_volume, _, need_weights, need_lobes = ctx.needs_input_grad
     volume_bar = _spread(result_bar, cells, weights, lobes, volume.shape[2:]) if need_volume else None
-    return volume_bar, None, *_pull_back(volume, cells, weights, lobes, result_bar, need_weights, need_lobes)
+    return volume_bar, None, *_needed_bars(volume, cells, weights, lobes, result_bar, need_weights, need_lobes)
 
 
 def _spread_setup(ctx: Any, inputs: tuple[Any, ...], output: torch.Tensor) -> None:
@@ -177,7 +177,7 @@ def _spread_backward(ctx: Any, volume_bar: torch.Tensor) -> tuple[torch.Tensor |
     flux, cells, weights, lobes = ctx.saved_tensors
     need_flux, _, need_weights, need_lobes, _ = ctx.needs_input_grad
     flux_bar = _gather(volume_bar, cells, weights, lobes) if need_flux else None
-    return flux_bar, None, *_pull_back(volume_bar, cells, weights, lobes, flux, need_weights, need_lobes), None
+    return flux_bar, None, *_needed_bars(volume_bar, cells, weights, lobes, flux, need_weights, need_lobes), None
 
 
 _gather.register_autograd(_gather_backward, setup_context=_gather_setup)
